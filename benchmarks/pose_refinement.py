@@ -2,14 +2,20 @@
 refinement of the disturbed ones.
 
     python benchmarks/pose_refinement.py yard --iterations 2000 [--degrees 0.3] [--share 0.01] [--device D]
+    python benchmarks/pose_refinement.py yard --time [--iterations 500] [--blocks 20] [--device D]
 
 The data set is that of `fidsplat demo views -o yard`. Each training pose is rotated by normal numbers of so
 many degrees, and moved by this share of the median depth of the points. Prints PSNR and SSIM of the held-out
 views, the errors of the poses relative to the first one, and milliseconds per step.
+
+`--time` compares steps with and without refinement, on the splats of a training of N iterations:
+interleaved blocks of 50 steps, by the clock, without densification. A ratio is the median over blocks of the
+time relative to the block without refinement next to it.
 """
 
 import math
 import time
+from argparse import Namespace
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +25,9 @@ import fidsplat as fs
 from fidsplat.cameras.pose_offset import offset_camera
 from fidsplat.splats.rotations import nearest_rotation
 from fidsplat.train import Dataset, Trainer, load_dataset
+
+BLOCK = 50
+"""steps of a block"""
 
 
 def main() -> None:
@@ -30,8 +39,13 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=0.01, help="of positions, relative to the depth")
     parser.add_argument("--rate", type=float, default=5e-3, help="learning rate of poses")
     parser.add_argument("--refined-only", action="store_true", help="only the last of the three")
+    parser.add_argument("--time", action="store_true", help="only compare the times of steps")
+    parser.add_argument("--blocks", type=int, default=20, help="of 50 steps, with --time")
     words = parser.parse_args()
     renderer, given = fs.Renderer(words.device), load_dataset(words.dataset)
+    if words.time:
+        compare_times(given, renderer, words)
+        return
     off = disturbed(given, math.radians(words.degrees), words.share)
     changes = {"pose_rate": words.rate, "pose_rate_end": words.rate / 100}
     rows = {}
@@ -61,6 +75,39 @@ def main() -> None:
             heads,
             [(name, *(f"{value:.4g}" for value in row.values())) for name, row in rows.items()],
         )
+
+
+def compare_times(dataset: Dataset, renderer: fs.Renderer, words: Namespace) -> None:
+    start = Trainer(dataset, renderer, iterations=words.iterations, max_splats=words.max_splats).run()
+    refined = {
+        "none": (),
+        "poses": ("refine_poses",),
+        "intrinsics": ("refine_intrinsics",),
+        "exposures": ("fit_exposures",),
+        "all": ("refine_poses", "refine_intrinsics", "fit_exposures"),
+    }
+    changes = {"densify_until": 0, "sh_every": 1, "iterations": 10**6, "max_splats": len(start)}
+    trainers = {
+        name: Trainer(dataset, renderer, start=start, **changes, **dict.fromkeys(switches, True))
+        for name, switches in refined.items()
+    }
+    times: dict[str, list[float]] = {name: [] for name in trainers}
+    for block in range(words.blocks + 1):
+        for name, trainer in trainers.items():
+            trainer.step()  # records the command lists, which the other trainers have replaced
+            begun = time.perf_counter()
+            for _ in range(BLOCK):
+                trainer._advance(late=True)  # as `run` does
+            trainer._read_losses()  # waits for the last step
+            if block:
+                times[name].append(1e3 * (time.perf_counter() - begun) / BLOCK)
+    rows = {}
+    for name, values in times.items():
+        ratio = float(np.median(np.array(values) / times["none"]))
+        rows[name] = {"step, ms": float(np.median(values)), "fastest, ms": min(values), "ratio": ratio}
+    if not keep(facts(renderer) | {"splats": len(start), "rows": rows}, words.json):
+        table = [(name, *(f"{value:.4g}" for value in row.values())) for name, row in rows.items()]
+        show(f"{dataset.name}, {len(start):,} splats", ("refined", *next(iter(rows.values()))), table)
 
 
 def disturbed(dataset: Dataset, angle: float, share: float) -> Dataset:

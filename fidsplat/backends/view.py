@@ -85,6 +85,9 @@ class View:
     """sub-frames of an exposure; empty for a single pose"""
     band: tuple[int, int] | None = None
     """rows of samples [first, end) to render, bit-identical to those of the complete frame; None: all"""
+    device_record: Any = None
+    """uniforms of the projection in device memory (`opencl.buffers.DeviceRecord`), used instead of those of
+    this view; None: there are none"""
 
     @property
     def lens(self) -> Lens | None:

@@ -21,7 +21,7 @@ from fidsplat.util.files import atomic_write, from_json
 from fidsplat.util.npy import load_npz
 from fidsplat.util.provenance import code_hash
 
-_FORMAT = 4
+_FORMAT = 5
 _GROUPS = ("values", "first", "second")
 _VALUES = tuple(f"values.{name}" for name in NAMES)
 _HISTORY = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}

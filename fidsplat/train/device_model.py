@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.interface import Images, ResidentData
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.densify import Densification, limited_logits
@@ -18,6 +19,7 @@ from fidsplat.train.optimiser import HIGHER_SH_RATE
 from fidsplat.train.parameters import NAMES, SHAPES, Splats
 from fidsplat.train.random_numbers import RandomStream
 from fidsplat.train.settings import TrainSettings
+from fidsplat.train.view_refinement import ViewRefinement
 
 _PREFIXES = ("", "first_", "second_")
 _STATISTICS = ("gradient_sums", "visible_counts")
@@ -30,8 +32,12 @@ class DeviceModel:
         """kernels: the result of `Backend.training`."""
         self._kernels, self._settings = kernels, settings
         self.max_pending_losses = kernels.max_pending_losses
-        kernels.load_views([(view.image, view.mask) for view in views])
+        cameras = [view.camera for view in views]
+        intrinsics = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras])
+        kernels.load_views([(view.image, view.mask) for view in views], intrinsics)
         self._number = 0
+        self._cameras = cameras
+        self._refinement: ViewRefinement | None = None
 
     def load(self, splats: Splats) -> None:
         """Copy splats to the device."""
@@ -79,18 +85,36 @@ class DeviceModel:
         """The splats as a cloud to render, with SH of this degree."""
         return self._kernels.resident(degree, origin)
 
-    def loss(
-        self, images: Images, view: int, exposure: np.ndarray | None = None
-    ) -> tuple[Callable[[], Loss], Any]:
+    def refine(self, refinement: ViewRefinement, views: Sequence[View]) -> None:
+        """Refine the views in later steps. views: their uniforms, with the cameras of the data set."""
+        self._refinement = refinement
+        self._kernels.load_refinement(refinement.arrays(), views, refinement.rows)
+
+    def read_refinement(self) -> None:
+        """Copy refined cameras and exposures to the host."""
+        if self._refinement is not None:
+            self._refinement.set_arrays(self._kernels.read_refinement())
+
+    def camera(self, view: int) -> Camera:
+        """The camera of the captures of a view; the device replaces it by the refined one."""
+        return self._cameras[view]
+
+    def refined_view(self, pipeline: Any, view: View, number: int) -> View:
+        """The uniforms of view `number` with the refined camera."""
+        if not self._settings.refines_cameras:
+            return view
+        return self._kernels.refined_view(pipeline, view, number)
+
+    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], Any]:
         """A function that waits for the loss of a rendered view, and the gradient (h, w, 3) on the device."""
-        value, gradient = self._kernels.loss(images, view, self._settings.dssim_weight, exposure)
+        settings = self._settings
+        exposed = settings.fit_exposures and self._refinement is not None
+        value, gradient = self._kernels.loss(images, view, settings.dssim_weight, exposed)
         return lambda: Loss(*value()), gradient
 
-    def normal_loss_gradients(
-        self, images: Images, view: int, camera: Camera, weight: float
-    ) -> dict[str, Any]:
+    def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, Any]:
         """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
-        return self._kernels.normal_loss_gradients(images, view, camera, weight)
+        return self._kernels.normal_loss_gradients(images, view, weight)
 
     def backward_per_tile(self, pipeline: Any, images: Images, gradients: Mapping[str, Any]) -> Any:
         """The backward pass up to the gradients by tile, for `accumulate_statistics` and `step`."""
@@ -98,7 +122,7 @@ class DeviceModel:
 
     def accumulate_statistics(self, by_tiles: Any, camera: Camera, origin: np.ndarray) -> None:
         """Add screen-space gradients and visibility to the densification statistics."""
-        self._kernels.accumulate_statistics(by_tiles, camera, origin)
+        self._kernels.accumulate_statistics(by_tiles)
 
     def step(
         self,
@@ -107,9 +131,8 @@ class DeviceModel:
         step: int,
         camera: Camera | None,
         origin: np.ndarray,
-    ) -> Callable[[], np.ndarray] | None:
-        """Apply one step of Adam. camera: if given, statistics are accumulated first. Returns a function that
-        waits for the gradient (10,) of the camera, pose and intrinsics, if it is refined."""
+    ) -> None:
+        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
         settings, count = self._settings, max(1, self._number)
         correction = 1 / (1 - settings.beta1**step)
         sizes = {name.removeprefix("log_"): correction * value for name, value in rate.items()}
@@ -122,7 +145,27 @@ class DeviceModel:
             "scale_penalty": settings.scale_penalty / (settings.axes * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }
-        return self._kernels.step(by_tiles, sizes, numbers, camera, origin, settings.refines_cameras)
+        self._kernels.step(by_tiles, sizes, numbers, camera is not None, settings.refines_cameras)
+
+    def refine_view(self, by_tiles: Any, view: int, iteration: int) -> None:
+        """Apply the step of a view's camera and exposure, after `step`."""
+        refinement, settings, kernels = self._refinement, self._settings, self._kernels
+        assert refinement is not None
+        betas = {"beta1": settings.beta1, "beta2": settings.beta2}
+        if settings.refines_cameras:
+            args = {"row": view, "intrinsics_row": refinement.rows[view], "depth": refinement.depths[view]}
+            args |= betas | {"refine_pose": int(settings.refine_poses)}
+            args |= refinement.pose_step(view, iteration)
+            kernels.refine_camera(by_tiles, args)
+            for row in refinement.due_intrinsics(view, iteration):
+                step = betas | refinement.intrinsics_step(row, iteration)
+                kernels.refine_intrinsics(by_tiles, step | {"intrinsics_row": row}, len(self._cameras))
+        if settings.fit_exposures:
+            kernels.refine_exposure(betas | {"row": view} | refinement.exposure_step(view, iteration))
+
+    def centre_exposures(self) -> None:
+        """Set the means of the exposures over the views to 0; the splats' colours then compensate."""
+        self._kernels.centre_exposures(len(self._cameras))
 
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from fidsplat.backends.gradients import on_host
 from fidsplat.backends.interface import Backend, Images, ResidentData
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
@@ -17,6 +18,7 @@ from fidsplat.train.losses import Loss, exposed_loss, normal_loss
 from fidsplat.train.optimiser import adam_step, contributing, parameter_gradients, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
+from fidsplat.train.view_refinement import ViewRefinement
 
 _REACH = 3.0
 """radius of a splat's bounding sphere for the visibility statistic, in standard deviations"""
@@ -31,6 +33,9 @@ class HostModel:
     def __init__(self, backend: Backend, views: Sequence[TrainingView], settings: TrainSettings) -> None:
         self._backend, self._views, self._settings = backend, views, settings
         self._splats: Splats
+        self._refinement: ViewRefinement | None = None
+        self._by_exposure: np.ndarray | None = None
+        """gradient with respect to the exposure of the last frame"""
 
     def load(self, splats: Splats) -> None:
         """Start from these splats; training updates their arrays in place."""
@@ -62,19 +67,34 @@ class HostModel:
         """The splats as a cloud to render, with SH of this degree."""
         return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
 
-    def loss(
-        self, images: Images, view: int, exposure: np.ndarray | None = None
-    ) -> tuple[Callable[[], Loss], np.ndarray]:
+    def refine(self, refinement: ViewRefinement, views: Sequence[View]) -> None:
+        """Refine the views in later steps."""
+        self._refinement = refinement
+
+    def read_refinement(self) -> None:
+        """Nothing to do: refined cameras and exposures are in host memory."""
+
+    def camera(self, view: int) -> Camera:
+        """The current camera of a view."""
+        return self._views[view].camera if self._refinement is None else self._refinement.camera(view)
+
+    def refined_view(self, pipeline: Any, view: View, number: int) -> View:
+        """The uniforms of view `number`, unchanged: they have the refined camera."""
+        return view
+
+    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], np.ndarray]:
         """A function that returns the loss of a rendered view, and the gradient (h, w, 3)."""
         image, mask = self._views[view].image, self._views[view].mask
         target, weight = image * np.float32(1 / 255), self._settings.dssim_weight
-        loss, gradient = exposed_loss(images.read("rgb", 0), target, mask, weight, exposure)
+        fitted = self._refinement if self._settings.fit_exposures else None
+        exposure = None if fitted is None else fitted.exposures[view]
+        rgb = images.read("rgb", 0)
+        loss, gradient, self._by_exposure = exposed_loss(rgb, target, mask, weight, exposure)
         return lambda: loss, gradient
 
-    def normal_loss_gradients(
-        self, images: Images, view: int, camera: Camera, weight: float
-    ) -> dict[str, np.ndarray]:
+    def normal_loss_gradients(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
         """Gradients of the weighted normal loss with respect to `depth` and `normal`."""
+        camera = self.camera(view)
         mask, weights = self._views[view].mask, np.float32(weight) * images.read("alpha", 0)
         if mask is not None:
             weights *= mask
@@ -102,9 +122,8 @@ class HostModel:
         step: int,
         camera: Camera | None,
         origin: np.ndarray,
-    ) -> Callable[[], np.ndarray] | None:
-        """Apply one step of Adam. camera: if given, statistics are accumulated first. Returns a function that
-        returns the gradient (10,) of the camera, pose and intrinsics, if it is refined."""
+    ) -> None:
+        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
         if camera is not None:
             self.accumulate_statistics(gradients, camera, origin)
         arrays = {name: on_host(array) for name, array in gradients.items()}
@@ -113,9 +132,24 @@ class HostModel:
             sparse_adam_step(self._splats, contributing(arrays), raw, rate, self._settings, step)
         else:
             adam_step(self._splats, raw, rate, self._settings, step)
-        if not self._settings.refines_cameras:
-            return None
-        return lambda: np.concatenate([arrays["pose"], arrays["intrinsics"]])
+
+    def refine_view(self, gradients: Mapping[str, Any], view: int, iteration: int) -> None:
+        """Apply the step of a view's camera and exposure, after `step`."""
+        refinement, settings = self._refinement, self._settings
+        assert refinement is not None
+        if settings.refine_poses:
+            refinement.move(view, on_host(gradients["pose"]), iteration)
+        if settings.refine_intrinsics:
+            refinement.add_intrinsics(view, on_host(gradients["intrinsics"]))
+        for row in refinement.due_intrinsics(view, iteration):
+            refinement.change_intrinsics(row, iteration)
+        if self._by_exposure is not None:
+            refinement.expose(view, self._by_exposure, iteration)
+
+    def centre_exposures(self) -> None:
+        """Set the means of the exposures over the views to 0; the splats' colours then compensate."""
+        assert self._refinement is not None
+        self._refinement.centre_exposures()
 
     def add_noise(self, iteration: int, rate: float) -> None:
         """Add MCMC noise to the means. rate: learning rate of the means [m]."""

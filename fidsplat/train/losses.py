@@ -25,8 +25,6 @@ class Loss(NamedTuple):
     """the loss"""
     mse: float
     """mean squared error, for the PSNR"""
-    by_exposure: np.ndarray | None = None
-    """(2, 3) gradients with respect to logarithms of gains, and to offsets; None without an exposure"""
 
     @property
     def psnr(self) -> float:
@@ -87,18 +85,20 @@ def exposed_loss(
     mask: np.ndarray | None,
     dssim_weight: float,
     exposure: np.ndarray | None,
-) -> tuple[Loss, np.ndarray]:
-    """`image_loss` after a gain and an offset of each channel, and the gradient with respect to the image.
+) -> tuple[Loss, np.ndarray, np.ndarray | None]:
+    """`image_loss` after a gain and an offset of each channel.
 
     exposure: (2, 3) logarithms of gains, and offsets, by channel; None: gains of 1 and offsets of 0.
+
+    Returns the loss and its gradients with respect to the image and to the exposure (2, 3), None without one.
     """
     if exposure is None:
-        return image_loss(image, truth, mask, dssim_weight)
+        return *image_loss(image, truth, mask, dssim_weight), None
     gain, offset = np.exp(exposure[0]).astype(image.dtype), exposure[1].astype(image.dtype)
     loss, slope = image_loss(gain * image + offset, truth, mask, dssim_weight)
     by_gain = np.where(slope != 0, slope * gain * image, 0)  # ignored pixels may not be finite
     sums = np.array([gradient.sum(axis=(0, 1), dtype=np.float64) for gradient in (by_gain, slope)])
-    return loss._replace(by_exposure=sums), slope * gain
+    return loss, slope * gain, sums
 
 
 def _ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from fidsplat.backends.gradients import CapacityExceeded
 from fidsplat.backends.prepare import prepare
-from fidsplat.cameras import Camera
+from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
 from fidsplat.effects import FeatureSet, select
@@ -37,7 +37,7 @@ from fidsplat.train.parameters import Splats, TrainingError, initial_splats, spl
 from fidsplat.train.random_numbers import RandomStream, permutation
 from fidsplat.train.scores import ViewScore, score_view
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.view_refinement import INTRINSICS_EVERY, ViewRefinement, with_exposure_of
+from fidsplat.train.view_refinement import ViewRefinement, with_exposure_of
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, instance, invalid, items, settings_with
 from fidsplat.util.errors import DeviceError, InputError
@@ -136,10 +136,11 @@ class Trainer:
             self._refinement = ViewRefinement(dataset, self.settings)
         self._state = self._begin(start, restart)
         self._model.load(self._state.splats)
+        if self._refinement is not None:
+            uniforms = [View.of(capture, dataset.origin) for capture in self._captures]
+            self._model.refine(self._refinement, uniforms)
         self._pending: deque[tuple[int, int, Callable[[], Loss]]] = deque()
         """iterations and indices of views whose losses are not read yet"""
-        self._camera_gradients: deque[tuple[int, int, Callable[[], np.ndarray]]] = deque()
-        """iterations and indices of views whose camera gradients are not applied yet"""
         self._unreported: deque[tuple[int, str, Loss]] = deque()
         """iterations, names of views and losses of steps that are not reported yet"""
         self._failure: TrainingError | None = None
@@ -205,7 +206,7 @@ class Trainer:
     @property
     def views(self) -> tuple[TrainingView, ...]:
         """The training views, with refined cameras."""
-        self._refine_cameras()
+        self._read_refinement()
         if self._refinement is None:
             return self.dataset.views
         refinement = self._refinement
@@ -215,7 +216,7 @@ class Trainer:
 
     def pose_changes(self) -> np.ndarray:
         """(views, 2): metres and degrees by which the refined poses differ from the data set's."""
-        self._refine_cameras()
+        self._read_refinement()
         if self._refinement is None or not self.settings.refine_poses:
             return np.zeros((len(self.dataset.views), 2))
         return self._refinement.pose_changes()
@@ -224,7 +225,7 @@ class Trainer:
     def exposures(self) -> np.ndarray:
         """(views, 2, 3): gains, and offsets in display values, by channel, that map rendered colours to each
         training image."""
-        self._read_losses()
+        self._read_refinement()
         if self._refinement is None:
             return np.tile([[[1.0] * 3, [0.0] * 3]], (len(self.dataset.views), 1, 1))
         gains = np.exp(self._refinement.exposures[:, :1])
@@ -238,7 +239,7 @@ class Trainer:
         """
         splats, origin, matrix = self._checked_splats(), self.dataset.origin, np.eye(4)
         if self._refinement is not None and self.settings.refine_poses:
-            self._refine_cameras()
+            self._read_refinement()
             matrix = self._refinement.to_dataset()
         if self.dataset.boxes:
             means = (splats.values["means"] + origin) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -261,7 +262,7 @@ class Trainer:
         if self.checkpoint is None:
             return
         self._state.splats = self._checked_splats()
-        self._refine_cameras()
+        self._read_refinement()
         views = {} if self._refinement is None else self._refinement.arrays()
         state = TrainingState(self.iteration, self._state.splats, self.history, views)
         title = self.renderer.device.title
@@ -284,6 +285,7 @@ class Trainer:
         resident = self.renderer.upload(self.cloud())
         refined = self._refinement
         if refined is not None:
+            self._read_refinement()
             cameras = (refined.with_intrinsics(view.camera, view.camera) for view in views)
             views = tuple(replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True))
         captures = [self._capture(view) for view in views]
@@ -331,18 +333,9 @@ class Trainer:
         self._densify()
         iteration = state.iteration + 1
         number = self._view_at(iteration)
-        if settings.refine_intrinsics and iteration % INTRINSICS_EVERY == 0:
-            self._refine_cameras()
-            assert self._refinement is not None
-            self._refinement.change_intrinsics(iteration)
-        self._refine_cameras(of=number)
         self._use_camera(number)
-        if settings.fit_exposures and self._refinement is not None:
-            first = (iteration - 1) % len(self.dataset.views) == 0
-            if first or any(of == number for _, of, _ in self._pending):
-                self._read_losses()
-            if first:
-                self._refinement.centre_exposures()
+        if settings.fit_exposures and (iteration - 1) % len(self.dataset.views) == 0:
+            self._model.centre_exposures()
         try:
             loss, gradients = self._differentiated(iteration, number, waits=False)
         except CapacityExceeded:
@@ -351,9 +344,7 @@ class Trainer:
         full = len(self._pending) > self._model.max_pending_losses
         if not late or full or settings.densifies_after(iteration):
             self._read_losses()
-        by_camera = self._update(gradients, iteration, self._camera(number))
-        if by_camera is not None:
-            self._camera_gradients.append((iteration, number, by_camera))
+        self._update(gradients, iteration, number)
         state.iteration = iteration
         state.history["counts"][iteration - 1] = len(self._model)
 
@@ -380,42 +371,23 @@ class Trainer:
                 history["losses"][iteration - 1], history["psnrs"][iteration - 1] = loss.value, loss.psnr
                 self._unreported.append((iteration, view, loss))
                 self._pending.popleft()
-                if loss.by_exposure is not None and self._refinement is not None:
-                    self._refinement.expose(number, loss.by_exposure, iteration)
         if self._failure is not None:
             raise self._failure
 
-    def _refine_cameras(self, of: int | None = None) -> None:
-        """Apply pending camera gradients. They are applied before their view is rendered again, so that
-        results do not depend on when gradients are read.
-
-        of: index of a view; does nothing without pending gradients of this view.
-        """
-        refinement = self._refinement
-        if refinement is None or (
-            of is not None and all(number != of for _, number, _ in self._camera_gradients)
-        ):
-            return
-        while self._camera_gradients:
-            iteration, number, read = self._camera_gradients.popleft()
-            by_camera = read()
-            if not np.isfinite(by_camera).all():
-                raise TrainingError(
-                    f"the gradient of the camera of {self.dataset.views[number].name} is not finite at "
-                    f"iteration {iteration}; " + self._checkpoint_state()
-                )
-            if self.settings.refine_poses:
-                refinement.move(number, by_camera[:6], iteration)
-            refinement.add_intrinsics(number, by_camera[6:])
-
-    def _camera(self, number: int) -> Camera:
-        """The current camera of a training view."""
-        refined = self._refinement
-        return self.dataset.views[number].camera if refined is None else refined.cameras[number]
+    def _read_refinement(self) -> None:
+        """Copy refined cameras and exposures from the device. Raises TrainingError if one is not finite."""
+        self._model.read_refinement()
+        if self._refinement is not None:
+            for name, array in self._refinement.arrays().items():
+                if not np.isfinite(array).all():
+                    raise TrainingError(
+                        f"the {name} of the views are not finite after iteration {self.iteration}; "
+                        + self._checkpoint_state()
+                    )
 
     def _use_camera(self, number: int) -> None:
         """Set the current camera in the captures of a training view."""
-        camera = self._camera(number)
+        camera = self._model.camera(number)
         if self._captures[number].camera is not camera:
             self._captures[number] = replace(self._captures[number], camera=camera)
             self._surface_captures[number] = replace(self._surface_captures[number], camera=camera)
@@ -445,13 +417,12 @@ class Trainer:
             self._features = features
             self._compile_next(iteration, plain, surface)
         pipeline = self._differentiate(features)
+        prepared = self._model.refined_view(pipeline, prepared, number)
         images = pipeline.forward(resident, prepared, waits)
-        fitted = self._refinement if self.settings.fit_exposures else None
-        exposure = None if fitted is None else fitted.exposures[number].copy()
-        loss, by_rgb = self._model.loss(images, number, exposure)
+        loss, by_rgb = self._model.loss(images, number)
         by_images = {"rgb": by_rgb}
         if by_normals:
-            by_images |= self._model.normal_loss_gradients(images, number, self._camera(number), by_normals)
+            by_images |= self._model.normal_loss_gradients(images, number, by_normals)
         if by_distortions:
             view = self.dataset.views[number]
             mask = np.ones(view.image.shape[:2], np.float32) if view.mask is None else view.mask
@@ -535,23 +506,24 @@ class Trainer:
             if iteration % settings.reset_every == 0:
                 self._model.reset_opacities()
 
-    def _update(self, gradients: Any, iteration: int, camera: Camera) -> Callable[[], np.ndarray] | None:
-        """Update the splats by Adam, unless densification by the default strategy follows, as in 2DGS (whose
-        new splats have no gradient yet). Returns a function that reads the gradient of a refined camera."""
+    def _update(self, gradients: Any, iteration: int, number: int) -> None:
+        """Update the splats and the view by Adam, unless densification by the default strategy follows, as in
+        2DGS (whose new splats have no gradient yet)."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
-        origin = self.dataset.origin
+        origin, camera = self.dataset.origin, self._model.camera(number)
         if not mcmc_runs and settings.densifies_after(iteration):
             self._model.accumulate_statistics(gradients, camera, origin)
-            return None
+            return
         counted = camera if not mcmc_runs and iteration < settings.densify_until else None
         rate = learning_rates(settings, iteration, self.dataset.extent)
-        by_camera = self._model.step(gradients, rate, settings.adam_steps(iteration), counted, origin)
+        self._model.step(gradients, rate, settings.adam_steps(iteration), counted, origin)
+        if self._refinement is not None:
+            self._model.refine_view(gradients, number, iteration)
         if mcmc_runs:
             with self._all_or_failed():
                 if settings.densifies_after(iteration):
                     self._model.load(mcmc.relocate_and_grow(self._model.read(), settings, iteration))
                 self._model.add_noise(iteration, rate["means"])
-        return by_camera
 
     @contextmanager
     def _all_or_failed(self) -> Iterator[None]:

@@ -14,8 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from fidsplat.backends.view import rotated
 from fidsplat.cameras import Camera
-from fidsplat.cameras.pose_offset import offset_camera
+from fidsplat.cameras.pose_offset import offset_pose
+from fidsplat.cameras.screw import rotation_matrix
 from fidsplat.splats.rotations import nearest_rotation
 from fidsplat.train.dataset import Dataset, TrainingView, depths
 from fidsplat.train.settings import TrainSettings
@@ -23,10 +25,8 @@ from fidsplat.vision.pose import pose_error
 
 _EPSILON = 1e-12
 """epsilon of Adam, small against gradients, which are means over pixels"""
-_AT_ORIGIN = Camera.pinhole(4, 4, 4, 4, 2, 2)
 INTRINSICS_EVERY = 10
-"""iterations between two steps of the intrinsics, by sums of gradients. A step needs the gradients of all
-views of a camera, for which a GPU would have to wait in each iteration"""
+"""iterations between two steps of the intrinsics, by sums of gradients of several views"""
 
 
 class _Adam:
@@ -36,84 +36,137 @@ class _Adam:
 
     def __init__(self, rows: int, size: int, settings: TrainSettings) -> None:
         self._betas = settings.beta1, settings.beta2
-        self.moments = np.zeros((2, rows, size))
+        self.moments = np.zeros((rows, 2, size))
         self.steps = np.zeros(rows, np.int64)
 
-    def direction(self, row: int, gradient: np.ndarray) -> np.ndarray:
-        """The step (size,) of a row, in units of the learning rate."""
+    def next_step(self, row: int, rate: float) -> dict[str, float]:
+        """Count a step of a row; returns the learning rate and the bias corrections of both moments."""
         self.steps[row] += 1
-        step, corrected = int(self.steps[row]), []
-        for moments, beta, sample in zip(self.moments, self._betas, (gradient, gradient**2), strict=True):
-            moments[row] += (1 - beta) * (sample - moments[row])
-            corrected.append(moments[row] / (1 - beta**step))
+        corrections = [1 - beta ** int(self.steps[row]) for beta in self._betas]
+        return {"rate": rate, "correction1": corrections[0], "correction2": corrections[1]}
+
+    def step(self, row: int, gradient: np.ndarray, rate: float) -> np.ndarray:
+        """Count a step of a row; returns the change of its parameters (size,)."""
+        numbers, corrected = self.next_step(row, rate), []
+        for moment, (beta, sample) in enumerate(zip(self._betas, (gradient, gradient**2), strict=True)):
+            self.moments[row, moment] += (1 - beta) * (sample - self.moments[row, moment])
+            corrected.append(self.moments[row, moment] / numbers[f"correction{moment + 1}"])
         mean, square = (moment.reshape(2, -1) for moment in corrected)
-        return (-mean / (np.sqrt(square.mean(axis=1, keepdims=True)) + _EPSILON)).ravel()
+        return rate * (-mean / (np.sqrt(square.mean(axis=1, keepdims=True)) + _EPSILON)).ravel()
 
 
 class ViewRefinement:
-    """Refined cameras and exposures of the training views."""
+    """Refined cameras and exposures of the training views. On devices with training kernels the arrays are
+    updated in device memory (kernels/opencl/train/refine_camera.cl), and copied here for reports."""
 
     def __init__(self, dataset: Dataset, settings: TrainSettings) -> None:
-        self._settings = settings
+        self._settings, self._origin = settings, dataset.origin
         self._initial = [view.camera for view in dataset.views]
-        self.cameras = list(self._initial)
-        """current cameras"""
-        self.exposures = np.zeros((len(self._initial), 2, 3))
+        count = len(self._initial)
+        self._initial_poses = np.tile(np.eye(4), (count, 1, 1))
+        for pose, camera in zip(self._initial_poses, self._initial, strict=True):
+            pose[:3, :3] = camera.world_to_camera[:3, :3]
+            pose[:3, 3] = rotated(-pose[:3, :3], camera.position - self._origin)
+        self.poses = self._initial_poses.copy()
+        """(views, 4, 4) world to camera, relative to the data set's origin, as on the device: the values are
+        small, also far from the world's origin"""
+        self.exposures = np.zeros((count, 2, 3))
         """logarithms of gains, and offsets, by channel; their means over the views are 0"""
-        self._depths = [_median_depth(view, dataset) for view in dataset.views]
+        self.depths = [_median_depth(view, dataset) for view in dataset.views]
+        """of the points about which the cameras rotate"""
         intrinsics = [camera_intrinsics(camera) for camera in self._initial]
         self._rows = {numbers: row for row, numbers in enumerate(dict.fromkeys(intrinsics))}
         """rows of `intrinsics` by the size and intrinsics in the data set"""
+        self.rows = [self._rows[numbers] for numbers in intrinsics]
+        """row of `intrinsics` of each view"""
         self.intrinsics = np.array([*self._rows])[:, 2:]
         """(cameras, 4): fx, fy, cx, cy"""
         self._intrinsics_sums = np.zeros(self.intrinsics.shape)
         """sums of the gradients since the last step"""
-        self._pose_adam, self._exposure_adam = (_Adam(len(self._initial), 6, settings) for _ in range(2))
+        self._unapplied: set[int] = set()
+        """rows with such gradients"""
+        self._pose_adam, self._exposure_adam = (_Adam(count, 6, settings) for _ in range(2))
         self._intrinsics_adam = _Adam(len(self.intrinsics), 4, settings)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Current cameras."""
+        return [self.camera(view) for view in range(len(self._initial))]
+
+    def camera(self, view: int) -> Camera:
+        """Current camera of a view."""
+        camera, pose = self._initial[view], self.poses[view]
+        if (pose != self._initial_poses[view]).any():
+            rotation = pose[:3, :3]
+            # orthogonal again: kernels multiply rotations, possibly in float32
+            rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = rotation.T, self._origin - rotation.T @ pose[:3, 3]
+            camera = camera.with_pose(camera_to_world=matrix)
+        return self.with_intrinsics(camera, self._initial[view])
 
     def move(self, view: int, grad_pose: np.ndarray, iteration: int) -> None:
         """Apply a step to the pose of a view. grad_pose: (6,) gradient of the loss by the pose."""
-        depth, gradient = self._depths[view], grad_pose.astype(np.float64)
+        depth, gradient = self.depths[view], grad_pose.astype(np.float64)
         pivot = np.array([0.0, 0.0, depth])
         gradient[:3] -= np.cross(pivot, gradient[3:])
         gradient[3:] *= depth
-        motion = self._settings.pose_rate_at(iteration) * self._pose_adam.direction(view, gradient)
+        motion = self._pose_adam.step(view, gradient, self._settings.pose_rate_at(iteration))
         motion[3:] *= depth
         # the rotation about the camera moves the pivot; move it back
-        rotated = offset_camera(_AT_ORIGIN, np.concatenate([motion[:3], np.zeros(3)]))
-        motion[3:] += pivot - rotated.world_to_camera[:3, :3] @ pivot
-        self.cameras[view] = offset_camera(self.cameras[view], motion)
+        motion[3:] += pivot - rotation_matrix(motion[:3]) @ pivot
+        self.poses[view] = offset_pose(self.poses[view], motion)
+
+    def pose_step(self, view: int, iteration: int) -> dict[str, float]:
+        """Count a step of a pose on the device; returns its learning rate and bias corrections."""
+        if not self._settings.refine_poses:
+            return {"rate": 0.0, "correction1": 1.0, "correction2": 1.0}
+        return self._pose_adam.next_step(view, self._settings.pose_rate_at(iteration))
 
     def add_intrinsics(self, view: int, by_intrinsics: np.ndarray) -> None:
         """Add a gradient (4,) of the loss of a view by its intrinsics to the sums."""
-        self._intrinsics_sums[self._rows[camera_intrinsics(self._initial[view])]] += by_intrinsics
+        self._intrinsics_sums[self.rows[view]] += by_intrinsics
 
-    def change_intrinsics(self, iteration: int) -> None:
-        """Apply a step, in units of the focal lengths, to the intrinsics, and clear the sums."""
+    def due_intrinsics(self, view: int, iteration: int) -> list[int]:
+        """Note that the sums of a view's row have a gradient; returns the rows whose step is due after an
+        iteration: the one before each multiple of `INTRINSICS_EVERY`, at which densification skips steps."""
+        if not self._settings.refine_intrinsics:
+            return []
+        self._unapplied.add(self.rows[view])
+        if (iteration + 1) % INTRINSICS_EVERY:
+            return []
+        due, self._unapplied = sorted(self._unapplied), set()
+        return due
+
+    def change_intrinsics(self, row: int, iteration: int) -> None:
+        """Apply a step, in units of the focal lengths, to a row of the intrinsics, and clear its sums."""
+        focal, sums = np.tile(self.intrinsics[row, :2], 2), self._intrinsics_sums[row]
         rate = self._settings.pose_rate_at(iteration)
-        for row, sums in enumerate(self._intrinsics_sums):
-            if sums.any():
-                focal = np.tile(self.intrinsics[row, :2], 2)
-                self.intrinsics[row] += rate * focal * self._intrinsics_adam.direction(row, sums * focal)
-        self._intrinsics_sums[:] = 0
-        self.cameras = [
-            self.with_intrinsics(camera, initial)
-            for camera, initial in zip(self.cameras, self._initial, strict=True)
-        ]
+        self.intrinsics[row] += focal * self._intrinsics_adam.step(row, sums * focal, rate)
+        sums[:] = 0
+
+    def intrinsics_step(self, row: int, iteration: int) -> dict[str, float]:
+        """Count a step of a row of the intrinsics on the device; returns its learning rate and bias
+        corrections."""
+        return self._intrinsics_adam.next_step(row, self._settings.pose_rate_at(iteration))
 
     def with_intrinsics(self, camera: Camera, initial: Camera) -> Camera:
         """The camera with the refined intrinsics of the training views that had the intrinsics of `initial`;
         unchanged without such views."""
         row = self._rows.get(camera_intrinsics(initial))
-        if row is None:
+        if row is None or camera_intrinsics(camera)[2:] == tuple(self.intrinsics[row]):
             return camera
         fx, fy, cx, cy = self.intrinsics[row].tolist()
         return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def expose(self, view: int, by_exposure: np.ndarray, iteration: int) -> None:
         """Apply a step to the exposure of a view. by_exposure: (2, 3) gradient of the loss."""
-        direction = self._exposure_adam.direction(view, by_exposure.ravel()).reshape(2, 3)
-        self.exposures[view] += self._settings.exposure_rate_at(iteration) * direction
+        rate = self._settings.exposure_rate_at(iteration)
+        self.exposures[view] += self._exposure_adam.step(view, by_exposure.ravel(), rate).reshape(2, 3)
+
+    def exposure_step(self, view: int, iteration: int) -> dict[str, float]:
+        """Count a step of an exposure on the device; returns its learning rate and bias corrections."""
+        return self._exposure_adam.next_step(view, self._settings.exposure_rate_at(iteration))
 
     def centre_exposures(self) -> None:
         """Set the means of the exposures over the views to 0; the splats' colours then compensate."""
@@ -136,19 +189,14 @@ class ViewRefinement:
         return np.array(differences) * (1, 180 / math.pi)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The state, for a checkpoint."""
-        return {
-            "poses": np.array([camera.world_to_camera for camera in self.cameras]),
-            "pose_moments": self._pose_adam.moments.copy(),
-            "pose_steps": self._pose_adam.steps.copy(),
-            "intrinsics": self.intrinsics.copy(),
-            "intrinsics_sums": self._intrinsics_sums.copy(),
-            "intrinsics_moments": self._intrinsics_adam.moments.copy(),
-            "intrinsics_steps": self._intrinsics_adam.steps.copy(),
-            "exposures": self.exposures.copy(),
-            "exposure_moments": self._exposure_adam.moments.copy(),
-            "exposure_steps": self._exposure_adam.steps.copy(),
+        """A copy of the state, for a checkpoint or a device."""
+        arrays = {
+            **{"poses": self.poses, "intrinsics": self.intrinsics, "exposures": self.exposures},
+            "intrinsics_sums": self._intrinsics_sums,
         }
+        for name, adam in self._adams():
+            arrays |= {f"{name}_moments": adam.moments, f"{name}_steps": adam.steps}
+        return {name: array.copy() for name, array in arrays.items()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Restore the state of a checkpoint; raise ValueError or LookupError if it does not fit the views."""
@@ -156,18 +204,22 @@ class ViewRefinement:
             array = arrays[name]
             if array.shape != own.shape or array.dtype != own.dtype or not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite {own.dtype} of the shape {own.shape}")
-        self.intrinsics, self._intrinsics_sums, self.exposures = (
-            arrays[name].copy() for name in ("intrinsics", "intrinsics_sums", "exposures")
+        self.set_arrays(arrays)
+        self._unapplied = set(np.flatnonzero(self._intrinsics_sums.any(axis=1)).tolist())
+        for name, adam in self._adams():
+            adam.steps = arrays[f"{name}_steps"].copy()
+
+    def set_arrays(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Set the state except numbers of steps."""
+        self.poses, self.intrinsics, self.exposures, self._intrinsics_sums = (
+            arrays[name].copy() for name in ("poses", "intrinsics", "exposures", "intrinsics_sums")
         )
-        self.cameras = [
-            self.with_intrinsics(
-                camera if (pose == camera.world_to_camera).all() else camera.with_pose(pose), camera
-            )
-            for camera, pose in zip(self._initial, arrays["poses"], strict=True)
-        ]
+        for name, adam in self._adams():
+            adam.moments = arrays[f"{name}_moments"].copy()
+
+    def _adams(self) -> list[tuple[str, _Adam]]:
         adams = self._pose_adam, self._intrinsics_adam, self._exposure_adam
-        for name, adam in zip(("pose", "intrinsics", "exposure"), adams, strict=True):
-            adam.moments, adam.steps = arrays[f"{name}_moments"].copy(), arrays[f"{name}_steps"].copy()
+        return list(zip(("pose", "intrinsics", "exposure"), adams, strict=True))
 
 
 def camera_intrinsics(camera: Camera) -> tuple[float, ...]:

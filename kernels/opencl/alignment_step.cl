@@ -65,23 +65,6 @@ static inline void solve(global const float *state, int size, float *step) {
     for (int i = 0; i < size; i++) step[i] *= scale[i];
 }
 
-// Set the view to the pose after a motion: rotation vector and translation in camera axes.
-static inline void move(global const real *pose, const float *motion, global real *view) {
-    real x = motion[0], y = motion[1], z = motion[2], square = x * x + y * y + z * z, angle = sqrt(square);
-    // Rodrigues' formula; sine: sin(angle) / angle, cosine: (1 - cos(angle)) / angle^2
-    real sine = angle > REAL(1e-4) ? sin(angle) / angle : 1 - square / 6;
-    real cosine = angle > REAL(1e-4) ? (1 - cos(angle)) / square : REAL(0.5) - square / 24;
-    real rotation[9] = {1 - cosine * (y * y + z * z), cosine * x * y - sine * z, cosine * x * z + sine * y,
-                        cosine * x * y + sine * z, 1 - cosine * (x * x + z * z), cosine * y * z - sine * x,
-                        cosine * x * z - sine * y, cosine * y * z + sine * x, 1 - cosine * (x * x + y * y)};
-    for (int i = 0; i < 3; i++) {
-        for (int j = 0; j < 3; j++)
-            view[3 * i + j] = rotation[3 * i] * pose[j] + rotation[3 * i + 1] * pose[3 + j] + rotation[3 * i + 2] * pose[6 + j];
-        view[9 + i] = rotation[3 * i] * pose[9] + rotation[3 * i + 1] * pose[10] + rotation[3 * i + 2] * pose[11] + motion[3 + i];
-    }
-    for (int j = 0; j < 3; j++) view[12 + j] = -(view[j] * view[9] + view[3 + j] * view[10] + view[6 + j] * view[11]);
-}
-
 // Index space: one work-item. Reads: the totals of a frame. Writes: the pose and the exposure of the next frame.
 kernel void align_step(
 //@@ arguments align_step
@@ -111,7 +94,10 @@ kernel void align_step(
     } else {
         fit[6] = state[NOISE];
         solve(state, 6 + 2 * channels, step);
-        move(pose, step, view);
+        real before[12], motion[6];
+        for (int k = 0; k < 12; k++) before[k] = pose[k];
+        for (int k = 0; k < 6; k++) motion[k] = step[k];
+        move(before, motion, view);
         float angle_square = step[0] * step[0] + step[1] * step[1] + step[2] * step[2];
         float shift_square = step[3] * step[3] + step[4] * step[4] + step[5] * step[5];
         state[CONVERGED] = focal * sqrt(angle_square + shift_square * state[INVERSE_DEPTH]) < tolerance;

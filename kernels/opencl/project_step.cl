@@ -1,7 +1,7 @@
 // Adam step on the gradients of project_splat_backward.cl, which stay in local memory: in training it replaces project_backward.
 // Index space: one work-item per splat, in groups of STEP_ITEMS.
-// Reads:  view, splats, keys, windows, big_bounds, gradient_offsets, record_gradients. Updates: if `add_statistics`, the sums of screen-space gradients;
-// if `update`, the parameters, Adam's moments, and the activated parameters.
+// Reads:  view, splats, keys, windows, big_bounds, gradient_offsets, record_gradients. Updates: if `add_statistics`, the sums of screen-space gradients and
+// the numbers of frames in whose frustum a splat was; if `update`, the parameters, Adam's moments, and the activated parameters.
 // IS_RGB, SH_COEFFICIENTS: from effect/color_*_backward.cl.
 #define STEP_ITEMS 64
 #define VALUES (3 * SH_COEFFICIENTS)       // rendered colour values per splat
@@ -10,6 +10,19 @@
 #else
 #define COEFFICIENTS_CAPACITY SH_COEFFICIENTS
 #endif
+// Whether the sphere of radius `reach` around a mean intersects the frustum.
+static inline bool in_frustum(global const View *view, float3 mean, float reach) {
+    float p[3];
+    for (uint k = 0; k < 3; k++)
+        p[k] = (float)view->rotation[3 * k] * mean.x + (float)view->rotation[3 * k + 1] * mean.y + (float)view->rotation[3 * k + 2] * mean.z
+             + (float)view->translation[k];
+    // pixels times depth, so that nothing is divided by a depth of 0
+    float focal_x = (float)view->focal_x, focal_y = (float)view->focal_y;
+    float u = focal_x * p[0] + (float)view->center_x * p[2], v = focal_y * p[1] + (float)view->center_y * p[2];
+    return p[2] > (float)view->near && u + focal_x * reach > 0.0f && u - focal_x * reach < (float)view->width * p[2]
+        && v + focal_y * reach > 0.0f && v - focal_y * reach < (float)view->height * p[2];
+}
+
 kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step(
 //@@ arguments project_step
 ) {
@@ -26,7 +39,14 @@ kernel __attribute__((reqd_work_group_size(STEP_ITEMS, 1, 1))) void project_step
             , activated_thickness
 #endif
         );
-        if (add_statistics) gradient_sums[i] += splat_grad.grad2d;
+        if (add_statistics) {
+            float reach = 3.0f * fmax(activated_scales[2 * i], activated_scales[2 * i + 1]);
+#if AXES == 3
+            reach = fmax(reach, 3.0f * activated_thickness[i]);
+#endif
+            gradient_sums[i] += splat_grad.grad2d;
+            visible_counts[i] += in_frustum(view, vload3(i, means), reach);
+        }
         for (int k = 0; k < 3; k++) grad_means[3 * item + k] = splat_grad.mean[k];
         for (int k = 0; k < 2; k++) grad_scales[AXES * item + k] = splat_grad.scale[k];
 #if AXES == 3

@@ -151,7 +151,9 @@ def test_refinement_does_not_drift_by_a_similarity(original):
     refinement = ViewRefinement(original, TrainSettings(refine_poses=True))
     drift = 1.03 * rigid_matrix((0.2, -0.1, 0.4), (0.98, 0.1, -0.1, 0.15))
     drift[3, 3] = 1.0
-    refinement.cameras = [moved(view.camera, drift) for view in original.views]
+    for pose, view in zip(refinement.poses, original.views, strict=True):
+        pose[:] = moved(view.camera, drift).world_to_camera
+        pose[:3, 3] += pose[:3, :3] @ original.origin
     np.testing.assert_allclose(refinement.to_dataset() @ drift, np.eye(4), atol=1e-12)
     assert refinement.pose_changes().max() < 1e-10
 
@@ -174,7 +176,7 @@ def test_exposures_return_to_the_truth(renderer, cloud, original):
 
 def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch):
     """Kernels of the derivatives by camera and exposure against the float64 reference."""
-    monkeypatch.setattr("fidsplat.train.trainer.INTRINSICS_EVERY", 2)
+    monkeypatch.setattr("fidsplat.train.view_refinement.INTRINSICS_EVERY", 2)
     results = []
     for device in (renderer, fs.Renderer("reference")):
         settings = {"iterations": 5, "sh_degree": 0} | RATES | ALL
@@ -191,7 +193,7 @@ def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch):
 
 
 def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path, monkeypatch):
-    monkeypatch.setattr("fidsplat.train.trainer.INTRINSICS_EVERY", 4)
+    monkeypatch.setattr("fidsplat.train.view_refinement.INTRINSICS_EVERY", 4)
     settings = {"iterations": 9, "sh_degree": 0} | ALL
     complete = Trainer(disturbed, renderer, start=cloud, **settings)
     complete.run()

@@ -27,7 +27,7 @@ from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import Counts
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.uniforms import projection_arrays
+from fidsplat.backends.opencl.uniforms import view_records
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.cameras.raster import raster_of
@@ -403,8 +403,8 @@ class _Replayed:
         buffers of the images of `PerturbedFrame`."""
         pool = workspace.pool
         self._workspace, self._recorded, self._origin = workspace, frame.recorded, origin
-        arrays = projection_arrays(frame.batch, frame.source, 0, frame.rows)
-        self._template, self.record = frame.view, arrays["view"]
+        self.record = view_records(frame.batch, 0, frame.rows, frame.source.records["View"])
+        self._template = frame.view
         rotation, commands = frame.source.uniform_groups.get("rotation", {}), frame.commands
         self._rotation = [(at, index) for index, name in rotation.items() for at in commands.positions(name)]
         """arguments that depend on the rotation, with indices of its elements"""

@@ -77,7 +77,11 @@ _STEP = (
     *("prelude", "math", "splat", "bounds", "record_gradients", "project_splat_backward"),
     *("train/activation_functions", "train/adam", "project_step"),
 )
-_TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
+_REFINE = "rigid_motion", "train/view_adam", "train/refine_camera"
+_TRAINING = (
+    *("surface", "view_adam", "exposure", "activation_functions", "activate", "gather_rows"),
+    "position_noise",
+)
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
@@ -255,8 +259,9 @@ def assemble_gradients(features: FeatureSet, config: KernelConfig) -> KernelSour
 
 def assemble_step(features: FeatureSet, config: KernelConfig, camera: bool = False) -> KernelSource:
     """Assemble a training step: the last stage of the backward pass, fused with Adam. camera: also sum the
-    gradient with respect to the camera."""
-    return _assemble_backward("step", _STEP, features, config, ("step_camera",) if camera else ())
+    gradient with respect to the camera, and refine cameras."""
+    stages, parts = ((*_STEP, *_REFINE), ("step_camera",)) if camera else (_STEP, ())
+    return _assemble_backward("step", stages, features, config, parts)
 
 
 def _assemble_backward(
@@ -269,7 +274,7 @@ def _assemble_backward(
     files += [effect.backward_file for effect in effects.values()]
     files += [EFFECT_CODE[part].file for part in parts]
     backward = {"BACKWARD_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
-    if stages is _STEP:
+    if name == "step":
         backward["AXES"] = 3 if "thickness" in effects else 2
     constants = build_constants(features, config) | backward
     assembler = Assembler(_scalars(features), constants, files, effects.values(), kernels=kernels_of(config))
@@ -321,7 +326,7 @@ def assemble_alignment_step(float64: bool) -> KernelSource:
         **{name: f"{getattr(alignment, name)}f" for name in ("MIN_GAIN", "MAX_GAIN")},
     }
     scalars = Scalars("double" if float64 else "float", "float")
-    return Assembler(scalars, constants).source({"alignment": ("prelude", "alignment_step")})
+    return Assembler(scalars, constants).source({"alignment": ("prelude", "rigid_motion", "alignment_step")})
 
 
 def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:

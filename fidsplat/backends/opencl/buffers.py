@@ -7,7 +7,7 @@ import math
 import mmap
 import weakref
 from collections.abc import Collection, Hashable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,6 +32,15 @@ class DeviceBuffer(cl.Buffer):
 def token_of(buffer: cl.Buffer) -> object:
     """The token of a buffer; a new one at each call for a sub-buffer."""
     return buffer.token if type(buffer) is DeviceBuffer else object()
+
+
+class DeviceRecord(NamedTuple):
+    """A record in a device buffer, for `BufferPool.upload` in place of a host array."""
+
+    buffer: cl.Buffer
+    offset: int
+    """bytes"""
+    nbytes: int
 
 
 class BufferPool:
@@ -109,10 +118,15 @@ class BufferPool:
         self.generation = object()
 
     def upload(
-        self, queue: cl.CommandQueue, name: str, array: np.ndarray
+        self, queue: cl.CommandQueue, name: str, array: np.ndarray | DeviceRecord
     ) -> tuple[cl.Buffer, cl.Event | None]:
         """Copy an array to a scratch buffer without waiting; returns the buffer and the event of the copy. A
         read-only array that the buffer already contains is not copied again."""
+        if isinstance(array, DeviceRecord):
+            buffer = self.scratch(name, array.nbytes)
+            return buffer, cl.enqueue_copy(
+                queue, buffer, array.buffer, src_offset=array.offset, byte_count=array.nbytes
+            )
         content = self._contents.get(name)
         if content is not None and content() is array:
             return self._buffers[name], None

@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.opencl.buffers import DeviceRecord
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import Capacity, Counts
 from fidsplat.backends.opencl.declare import Argument
@@ -145,8 +146,8 @@ class DeviceFrame:
         self.events: list[cl.Event] = []
         self.stages: list[str] = []
         """stage of each launch"""
-        self.arrays: dict[str, np.ndarray] = {}
-        """host arrays copied to the device for this view"""
+        self.arrays: dict[str, np.ndarray | DeviceRecord] = {}
+        """host arrays and records copied for this view"""
         self.uploads: list[cl.Event] = []
         """events of copies to the device"""
         self.acquired: dict[str, cl.Buffer] = {}
@@ -232,7 +233,7 @@ class DeviceFrame:
         buffer = self.acquired[name] = self.bind(name, self.pool.acquire(name, size))
         return buffer
 
-    def upload(self, name: str, array: np.ndarray) -> cl.Buffer:
+    def upload(self, name: str, array: np.ndarray | DeviceRecord) -> cl.Buffer:
         """Bind a scratch buffer with these contents; does not wait."""
         self.arrays[name] = array
         buffer, event = self.pool.upload(self.queue, name, array)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from typing import Any
@@ -231,19 +231,18 @@ class TileGradients:
             self._sum_gradients(frame, results, groups)
             return results
 
-    def step(
-        self, arguments: Mapping[str, Any], with_camera: bool = False
-    ) -> Callable[[], np.ndarray] | None:
+    def step(self, arguments: Mapping[str, Any], with_camera: bool = False) -> None:
         """Submit an optimiser step (kernels/opencl/project_step.cl), compiled by
         `OpenCLGradients.compile_step`.
 
-        arguments: values that the frame does not define. with_camera: whether to return a function that waits
-        for the gradient (10,) with respect to the camera: pose and intrinsics.
+        arguments: values that the frame does not define. with_camera: whether to sum the gradient with
+        respect to the camera, for `camera_sums`.
         """
         with self._latest_frame():
             frame, commands = self._frame, self.pipeline.step_commands[with_camera]
             arguments = {**arguments, "count": (count := frame.resident.count)}
-            groups = self._allocate_camera_sums(frame) if with_camera else 0
+            if with_camera:
+                self._allocate_camera_sums(frame)
             values = {
                 name: arguments[name] if name in arguments else frame.value(declared)
                 for name, declared in commands.program.source.arguments["project_step"].items()
@@ -256,7 +255,13 @@ class TileGradients:
             commands.set(values)
             frame.events += commands.submit(frame.queue)
             frame.stages.append("project backward")
-            return self._camera_readback(frame, groups) if with_camera else None
+
+    def camera_sums(self) -> dict[str, Any]:
+        """Arguments of the kernel `refine_camera` after `step` with `with_camera`."""
+        return {
+            "groups": -(-self._frame.resident.count // _GROUP),
+            "camera_sums": self._frame.named["camera_sums"],
+        }
 
     @contextmanager
     def _latest_frame(self) -> Iterator[None]:
@@ -280,27 +285,6 @@ class TileGradients:
         frame.launch(
             "project backward", "sum_gradients", (sum(_SUMS.values()) * _GROUP,), (_GROUP,), **arguments
         )
-
-    def _camera_readback(self, frame: DeviceFrame, groups: int) -> Callable[[], np.ndarray]:
-        """Sum the gradient of the camera over work-groups; returns a function that waits for it."""
-        frame = copy(frame)
-        frame.commands = self.pipeline.sum_commands
-        frame.commands.clear()
-        arrays = {name: frame.pool.array(frame.queue, name, (k,)) for name, k in _SUMS.items()}
-        self._sum_gradients(frame, arrays, groups)
-        gradient = np.empty(_CAMERA, np.float32)
-        copy_events = [
-            cl.enqueue_copy(frame.queue, part, arrays[name].data, is_blocking=False)  # pyright: ignore
-            for name, part in (("pose", gradient[:6]), ("intrinsics", gradient[6:]))
-        ]
-        frame.queue.flush()
-
-        def read() -> np.ndarray:
-            with frame.workspace.lock, frame.workspace.device_errors(_DOING):
-                cl.wait_for_events(copy_events)
-            return gradient
-
-        return read
 
     def _allocate_results(self, frame: DeviceFrame) -> dict[str, Array]:
         """Arrays for the gradients, reused by every call."""

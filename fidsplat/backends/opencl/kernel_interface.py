@@ -117,7 +117,7 @@ _BLEND = args(
     "out float raw  // 4 channels: r, g, b, transmittance",
 )
 
-_EXPOSURE = "float gain_red gain_green gain_blue offset_red offset_green offset_blue"
+_VIEW_ADAM = args("real rate beta1 beta2 correction1 correction2  // correction1: 1 - beta1^step")
 _LOSS_SIZE = args(
     "int width height  // width: values of a row, three per pixel",
     "int stride  // floats of an image's row",
@@ -132,7 +132,8 @@ _ALIGNED = args(
 _IMAGES = args("out float images")
 _SURFACE = args(
     _IMAGE_SIZE,
-    "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
+    "uint row  // of the view",
+    "in float lenses  // (views, 4): fx, fy, cx, cy",
 )
 _RENDERED_SH = args(
     *(
@@ -259,13 +260,29 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "float lr_means lr_scales lr_quats lr_logits  // learning rates",
         "float lr_sh lr_rest  // of degree 0; of higher degrees",
         "float scale_penalty opacity_penalty",
-        "out float gradient_sums",
+        "out float gradient_sums visible_counts",
         "out float means first_means second_means",
         "out float log_scales first_log_scales second_log_scales",
         "out float quats first_quats second_quats",
         "out float logits first_logits second_logits",
         "out float sh first_sh second_sh",
         "out float activated_quats activated_scales activated_opacities activated_sh",
+    ),
+    "refine_camera": args(
+        *("uint groups row intrinsics_row", "int refine_pose", _VIEW_ADAM),
+        "real depth  // [m] of the point about which the camera rotates",
+        "in real camera_sums  // (groups, 10)",
+        "out View views",
+        "out real pose_moments  // (views, 2, 6)",
+        "out real intrinsics_sums  // (rows, 4)",
+    ),
+    "refine_intrinsics": args(
+        *("uint count  // views", "uint intrinsics_row", _VIEW_ADAM),
+        "in uint intrinsics_rows  // (views)",
+        "out real intrinsics intrinsics_sums  // (rows, 4): fx, fy, cx, cy",
+        "out real intrinsics_moments  // (rows, 2, 4)",
+        "out View views",
+        "out float lenses  // (views, 4)",
     ),
     "sum_gradients": args(
         *("uint tiles groups", "in real background_sums camera_sums  // (tiles, 3), (groups, 10)"),
@@ -319,14 +336,21 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
         *("float l1_weight ssim_weight", "in float images", "out float grad_rgb"),
     ),
-    "apply_exposure": args("uint count  // pixels", _EXPOSURE, "in float rgb", "out float exposed"),
-    "exposure_backward": args(
-        "uint count",
-        _EXPOSURE,
-        "in float rgb",
-        "out float grad_rgb",
-        "out float exposure_sums  // (work-groups, 6)",
+    "apply_exposure": args(
+        *("uint count  // pixels", "uint row  // of the view"),
+        "in real exposures  // (views, 6): logarithms of gains, and offsets",
+        *("in float rgb", "out float exposed"),
     ),
+    "exposure_backward": args(
+        *("uint count  // pixels", "uint row  // of the view", "in real exposures", "in float rgb"),
+        "out float grad_rgb",
+        "out real exposure_sums  // (work-groups, 6)",
+    ),
+    "refine_exposure": args(
+        *("uint groups row", _VIEW_ADAM, "in real exposure_sums"),
+        "out real exposures exposure_moments  // (views, 2, 6): Adam's moments",
+    ),
+    "centre_exposures": args("uint count  // views", "out real exposures"),
     "surface_normals": args(
         _SURFACE,
         _MASK,
@@ -345,15 +369,6 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "gather_rows": args(
         *("uint count", "uint row copied  // floats per row, number of copied rows; later rows are zero"),
         *("in uint rows", "in float source", "out float gathered"),
-    ),
-    "count_visible": args(
-        "uint count",
-        _ROTATION,
-        "float translation_x translation_y translation_z  // camera-space position of the means' zero [m]",
-        "float focal_x focal_y center_x center_y near width height",
-        "uint axes",
-        "in float means activated_scales activated_thickness",
-        "out float visible_counts",
     ),
     "add_position_noise": args(
         *("uint count axes seed_low seed_high iteration", "uint random_stream"),

@@ -9,12 +9,13 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
+from fidsplat.backends.opencl.buffers import DeviceRecord
 from fidsplat.backends.opencl.counts import COUNTERS, Capacity, Counts, enlarged, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.resident import Resident
@@ -28,6 +29,8 @@ _VIEWS_BYTES = 1 << 26
 _UPLOADS = 64
 """maximum number of pending copies to the device"""
 _ZERO = np.zeros(1, np.uint32)
+_CachedView: TypeAlias = tuple[View, dict[str, np.ndarray | DeviceRecord], dict[str, Any]]
+"""a view with its arrays and scalar arguments"""
 
 
 class RecordedFrame:
@@ -48,7 +51,7 @@ class RecordedFrame:
         self._stages = self.commands.stages
         self._source = frame.source
         self._view, self._arrays = frame.view, frame.arrays
-        self._views: dict[int, tuple[View, dict[str, np.ndarray], dict[str, Any]]] = {
+        self._views: dict[int, _CachedView] = {
             id(frame.view): (frame.view, frame.arrays, scalar_arguments(frame.view, frame.source))
         }
         """rendered views with their arrays and scalar arguments"""
@@ -120,7 +123,7 @@ class RecordedFrame:
         frame.events, frame.stages = events, self._stages.copy()
         frame.counted, frame.stats = events[self.launches_until_counts - 1], rendered.stats
 
-    def _cache_view(self, view: View) -> tuple[View, dict[str, np.ndarray], dict[str, Any]]:
+    def _cache_view(self, view: View) -> _CachedView:
         arrays = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
         for name in self._source.view_arrays:
             arrays[name] = view.array(name)

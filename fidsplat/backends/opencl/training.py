@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
@@ -15,8 +14,9 @@ from fidsplat.backends.opencl.assemble import assemble_training
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.view_refinement import OpenCLViewRefinement
 from fidsplat.backends.opencl.workspace import Workspace
-from fidsplat.cameras import Camera
+from fidsplat.backends.view import View
 from fidsplat.util.errors import DeviceError
 
 _GROUP = 64
@@ -28,6 +28,8 @@ _SUM_GROUPS, _SUM_ITEMS = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
 _EXPOSURE_GROUPS = 64
 """work-groups of the sums for the gradient of the exposure"""
+_REFINE_ITEMS = {"refine_camera": 240, "refine_intrinsics": 64}
+"""work-group sizes of kernels/opencl/train/refine_camera.cl"""
 _ROWS_PER_ITEM = 4
 """rows per work-item of the vertical passes (ROWS_PER_ITEM of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
@@ -145,11 +147,14 @@ class OpenCLTraining:
         self._version = object()
         """a new object whenever the buffers of the splats change"""
         self._replayed: dict[str, CommandList] = {}
-        self._cameras: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
-        """origin and arguments of the kernel `count_visible` by camera"""
+        self._refinement: OpenCLViewRefinement | None = None
 
-    def load_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
-        """Copy the images to the device: (h, w, 3) uint8 each, with a mask (h, w) bool or None."""
+    def load_views(
+        self, views: Sequence[tuple[np.ndarray, np.ndarray | None]], intrinsics: np.ndarray
+    ) -> None:
+        """Copy the images to the device: (h, w, 3) uint8 each, with a mask (h, w) bool or None. intrinsics:
+        (views, 4) fx, fy, cx, cy."""
+        self._bound["lenses"] = self._upload("intrinsics", intrinsics.astype(np.float32))
         for image, mask in views:
             weights = np.zeros(1, np.uint8) if mask is None else mask.astype(np.uint8)
             values = image.size if mask is None else max(1, 3 * int(weights.sum()))
@@ -240,21 +245,21 @@ class OpenCLTraining:
         return self._resident[1]
 
     def loss(
-        self, images: Any, view: int, dssim_weight: float, exposure: np.ndarray | None = None
-    ) -> tuple[Callable[[], tuple[Any, ...]], Any]:
-        """Compare a frame with the ground truth of view number `view`. exposure: (2, 3) logarithms of gains,
-        and offsets, applied to the frame first; None: as rendered.
+        self, images: Any, view: int, dssim_weight: float, exposed: bool = False
+    ) -> tuple[Callable[[], tuple[float, float]], Any]:
+        """Compare a frame with the ground truth of view number `view`. exposed: whether the view's refined
+        exposure is applied to the frame first.
 
-        Returns a function that waits for the loss, the mean squared difference and, with an exposure, the
-        gradient (2, 3) with respect to it, to be called before `max_pending_losses` more frames; and the
-        gradient of the loss (h, w, 3), a device array that is valid until the next call.
+        Returns a function that waits for the loss and the mean squared difference, to be called before
+        `max_pending_losses` more frames; and the gradient of the loss (h, w, 3), a device array that is valid
+        until the next call.
         """
         rgb, (height, columns, _) = images.device_buffer("rgb")
-        rendered, exposure_arguments = rgb, _exposure_arguments(exposure)
-        if exposure_arguments:
+        exposure: dict[str, Any] = {}
+        if exposed:
+            exposure = {"row": view, "count": height * columns, "rgb": rgb}
             rgb = self._scratch("exposed", 12 * height * columns)
-            args = exposure_arguments | {"count": height * columns, "rgb": rendered, "exposed": rgb}
-            self._launch("apply_exposure", height * columns, args)
+            self._replay_exposure("apply_exposure", {**exposure, "exposed": rgb})
         target, size, in_strips = self._targets[view], 3 * height * columns, self._lanes > 1
         value_count, stride = target.values, self._stride(columns)
         grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if in_strips else (_SUM_GROUPS,)
@@ -288,40 +293,26 @@ class OpenCLTraining:
         events = self._replay("loss", (height, columns, dssim_weight), args, loss_launches)
         readback.submitted(slot, events[0 if in_strips else -1])
 
-        exposure_gradient: Callable[[], np.ndarray] | None = None
-        if exposure_arguments:
-            args = exposure_arguments | {"rgb": rendered, "grad_rgb": gradient.data}
-            args["count"] = height * columns
-            exposure_gradient = self._exposure_readback(args)
+        if exposed:
+            sums = self._scratch("exposure sums", 48 * _EXPOSURE_GROUPS)
+            args = {**exposure, "grad_rgb": gradient.data, "exposure_sums": sums}
+            self._replay_exposure("exposure_backward", args)
 
-        def value() -> tuple[Any, ...]:
+        def value() -> tuple[float, float]:
             self._queue.flush()
             with self._workspace.device_errors("training"):
                 absolute, squared, ssim = readback.read(slot)
-                more = () if exposure_gradient is None else (exposure_gradient(),)
             loss = (1 - dssim_weight) * absolute / value_count + dssim_weight * (1 - ssim / size)
-            return float(loss), float(squared / value_count), *more
+            return float(loss), float(squared / value_count)
 
         return value, gradient
 
-    def _exposure_readback(self, args: Mapping[str, Any]) -> Callable[[], np.ndarray]:
-        """Backpropagate the gradient through the exposure; returns a function that waits for the exposure's
-        gradient."""
-        groups = _EXPOSURE_GROUPS
-        sums, group_sums = self._scratch("exposure sums", 24 * groups), np.empty((groups, 6), np.float32)
-        launch = self._launch_of(
-            "exposure_backward", (groups * _GROUP,), (_GROUP,), {**args, "exposure_sums": sums}
-        )
-        self._enqueue(launch)
-        copied = cl.enqueue_copy(self._queue, group_sums, sums, is_blocking=False)
+    def _replay_exposure(self, kernel: str, args: Mapping[str, Any], groups: int = _EXPOSURE_GROUPS) -> None:
+        """Submit a kernel of kernels/opencl/train/exposure.cl."""
+        size = (groups * _GROUP,)
+        self._replay(kernel, (), args, lambda: [self._launch_of(kernel, size, (_GROUP,), args)])
 
-        def read() -> np.ndarray:
-            copied.wait()
-            return group_sums.sum(axis=0, dtype=np.float64).reshape(2, 3)
-
-        return read
-
-    def normal_loss_gradients(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
+    def normal_loss_gradients(self, images: Any, view: int, weight: float) -> dict[str, Any]:
         """Gradients of `train.losses.normal_loss` with respect to `depth` and `normal`, times the weight;
         device arrays that are valid until the next call."""
         depth, target = images.device_array("depth"), self._targets[view]
@@ -330,8 +321,7 @@ class OpenCLTraining:
         results = {name: self._array(f"grad {name}", shape) for name, shape in shapes.items()}
         args = {
             **{"width": width, "height": height, "mask": target.mask, "masked": int(target.masked)},
-            **{"inverse_x": 1 / camera.fx, "inverse_y": 1 / camera.fy},
-            **{"middle_x": camera.cx, "middle_y": camera.cy},
+            "row": view,
             **{name: images.device_array(name).data for name in ("depth", "normal", "alpha")},
             **{f"grad_{name}": array.data for name, array in results.items()},
             "normal_weight": weight / (width * height),
@@ -341,19 +331,19 @@ class OpenCLTraining:
             self._enqueue(self._row_launch(kernel, width, args, height))
         return results
 
-    def accumulate_statistics(self, gradients: Any, camera: Camera, origin: np.ndarray) -> None:
-        """Add a frame's `grad2d` to the statistics. gradients: result of `backward_per_tile`."""
-        self._step(gradients, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"update": 0, "sparse": 0}, camera, origin)
+    def accumulate_statistics(self, gradients: Any) -> None:
+        """Add a frame's `grad2d` and visibility to the statistics. gradients: result of
+        `backward_per_tile`."""
+        self._step(gradients, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"update": 0, "sparse": 0}, True, False)
 
     def step(
         self,
         gradients: Any,
         learning_rates: Mapping[str, float],
         hyperparameters: Mapping[str, float],
-        camera: Camera | None,
-        origin: np.ndarray,
+        statistics: bool,
         with_camera: bool = False,
-    ) -> Callable[[], np.ndarray] | None:
+    ) -> None:
         """Apply a step of Adam.
 
         Args:
@@ -362,42 +352,63 @@ class OpenCLTraining:
             hyperparameters: `beta1`, `beta2`, `epsilon`, `sqrt_correction2` (square root of 1 - beta2^step);
                 `scale_penalty` and `opacity_penalty`, added to the gradients; `sparse`: 1 to update only
                 splats that contribute to the frame.
-            camera: if given, statistics are accumulated first.
-            with_camera: whether to return a function that waits for the gradient (10,) with respect to pose
-                and intrinsics.
+            statistics: whether statistics are accumulated first.
+            with_camera: whether `refine_camera` follows.
         """
         args = {f"lr_{name}": rate for name, rate in learning_rates.items()} | dict(hyperparameters)
         args |= {
             "one_minus_beta1": 1 - hyperparameters["beta1"],
             "one_minus_beta2": 1 - hyperparameters["beta2"],
         }
-        return self._step(
-            gradients,
-            args | {"update": 1, "sparse": int(hyperparameters["sparse"])},
-            camera,
-            origin,
-            with_camera,
-        )
+        args |= {"update": 1, "sparse": int(hyperparameters["sparse"])}
+        self._step(gradients, args, statistics, with_camera)
 
-    def _step(
-        self,
-        gradients: Any,
-        args: Mapping[str, Any],
-        camera: Camera | None,
-        origin: np.ndarray,
-        with_camera: bool = False,
-    ) -> Callable[[], np.ndarray] | None:
+    def _step(self, gradients: Any, args: Mapping[str, Any], statistics: bool, with_camera: bool) -> None:
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
         gradients.pipeline.compile_step(with_camera)
-        if camera is not None:
-            self._count_visible(camera, origin)
-        return gradients.step({**self._bound, **args, "add_statistics": int(camera is not None)}, with_camera)
+        gradients.step({**self._bound, **args, "add_statistics": int(statistics)}, with_camera)
 
-    def _count_visible(self, camera: Camera, origin: np.ndarray) -> None:
-        if (cached := self._cameras.get(camera)) is None or cached[0] is not origin:
-            cached = self._cameras[camera] = origin, _camera_arguments(camera, origin)
-        args = cached[1]
-        self._replay("count", (), args, lambda: [self._row_launch("count_visible", self._count, args)])
+    def load_refinement(
+        self, arrays: Mapping[str, np.ndarray], views: Sequence[View], rows: Sequence[int]
+    ) -> None:
+        """Copy the state of `ViewRefinement` to the device. views: uniforms of the training views. rows: row
+        of `intrinsics` of each view."""
+        real = self._program.source.scalars.dtype("real")
+        self._refinement = OpenCLViewRefinement(self._workspace, real, arrays, views, rows, self._bound)
+
+    def read_refinement(self) -> dict[str, np.ndarray]:
+        """Copy the state of `ViewRefinement` to the host; waits for the device."""
+        assert self._refinement is not None
+        with self._workspace.device_errors("training"):
+            return self._refinement.read()
+
+    def refined_view(self, pipeline: Any, view: View, number: int) -> View:
+        """The view with the refined camera of training view `number`."""
+        assert self._refinement is not None
+        return self._refinement.refined(view, number, pipeline.source.records["View"])
+
+    def refine_camera(self, gradients: Any, args: Mapping[str, Any]) -> None:
+        """Apply a step of Adam to the camera of a frame, after `step` with its gradients."""
+        self._refine("refine_camera", gradients, {**args, **gradients.camera_sums()})
+
+    def refine_intrinsics(self, gradients: Any, args: Mapping[str, Any], views: int) -> None:
+        """Apply a step of Adam to a row of the intrinsics."""
+        self._refine("refine_intrinsics", gradients, {**args, "count": views})
+
+    def _refine(self, kernel: str, gradients: Any, args: Mapping[str, Any]) -> None:
+        """Submit a kernel of kernels/opencl/train/refine_camera.cl, which `step` has compiled."""
+        program, size = gradients.pipeline.step_commands[True].program, (_REFINE_ITEMS[kernel],)
+        self._replay(kernel, (), args, lambda: [self._launch_of(kernel, size, size, args, program)], program)
+
+    def refine_exposure(self, args: Mapping[str, Any]) -> None:
+        """Apply a step of Adam to the exposure of a view, after its `loss`."""
+        sums = self._scratch("exposure sums", 48 * _EXPOSURE_GROUPS)
+        args = {**args, "groups": _EXPOSURE_GROUPS, "exposure_sums": sums}
+        self._replay_exposure("refine_exposure", args, 1)
+
+    def centre_exposures(self, views: int) -> None:
+        """Set the means of the exposures over the views to 0."""
+        self._enqueue(self._launch_of("centre_exposures", (6,), (6,), {"count": views}))
 
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
         """Add MCMC noise to the means: steps size * sigmoid(slope (threshold - opacity)) * covariance *
@@ -422,11 +433,16 @@ class OpenCLTraining:
         )
 
     def _launch_of(
-        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], args: Mapping[str, Any]
+        self,
+        kernel: str,
+        size: tuple[int, ...],
+        group: tuple[int, ...],
+        args: Mapping[str, Any],
+        program: Program | None = None,
     ) -> Launch:
         """A launch with the values of its arguments, which is not submitted."""
         values = {**self._bound, "count": self._count, **args}
-        names = self._program.source.arguments[kernel]
+        names = (program or self._program).source.arguments[kernel]
         return kernel, size, group, [values[name] for name in names]
 
     def _enqueue(self, launch: Launch) -> None:
@@ -435,11 +451,20 @@ class OpenCLTraining:
             self._commands.launch(self._queue, *launch)
 
     def _replay(
-        self, name: str, key: tuple[Any, ...], args: Mapping[str, Any], launches: Callable[[], list[Launch]]
+        self,
+        name: str,
+        key: tuple[Any, ...],
+        args: Mapping[str, Any],
+        launches: Callable[[], list[Launch]],
+        program: Program | None = None,
     ) -> list[cl.Event]:
         """Replay a command list of a training step with the arguments `args`. launches: returns the
-        launches; called to record again if the key, the splats or the buffers have changed."""
-        commands = self._replayed.setdefault(name, CommandList(self._program))
+        launches; called to record again if the key, the splats, the buffers or the program have changed.
+        program: of the kernels; None: the program of the training kernels."""
+        program = program or self._program
+        commands = self._replayed.get(name)
+        if commands is None or commands.program is not program:
+            commands = self._replayed[name] = CommandList(program)
         key = (*key, self._version, self._workspace.pool.generation)
         with self._workspace.device_errors("training"):
             if commands.key != key:
@@ -476,23 +501,3 @@ class OpenCLTraining:
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
         self._loss_images = (height, columns), buffer
         return buffer
-
-
-def _exposure_arguments(exposure: np.ndarray | None) -> dict[str, float]:
-    """Arguments of the kernels of exposure: gains and offsets; none without an exposure."""
-    if exposure is None:
-        return {}
-    logarithms, offsets = exposure
-    channels = ("red", "green", "blue")
-    gains = zip((f"gain_{name}" for name in channels), np.exp(logarithms).tolist(), strict=True)
-    return dict(gains) | dict(zip((f"offset_{name}" for name in channels), offsets.tolist(), strict=True))
-
-
-def _camera_arguments(camera: Camera, origin: np.ndarray) -> dict[str, float]:
-    rotation = camera.world_to_camera[:3, :3]
-    names = [f"rotation_{i}{j}" for i in range(3) for j in range(3)]
-    args = dict(zip(names, rotation.ravel().tolist(), strict=True))
-    translation = rotation @ (origin - camera.position)
-    args |= dict(zip(("translation_x", "translation_y", "translation_z"), translation.tolist(), strict=True))
-    args |= {"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy}
-    return args | {"near": camera.near, "width": camera.width, "height": camera.height}

@@ -8,6 +8,7 @@ import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import KernelSource
+from fidsplat.backends.opencl.buffers import DeviceRecord
 from fidsplat.backends.view import View
 
 
@@ -32,10 +33,14 @@ def scalar_arguments(view: View, source: KernelSource) -> dict[str, Any]:
     return scalars
 
 
-def projection_arrays(views: ViewBatch, source: KernelSource, row: int, end: int) -> dict[str, np.ndarray]:
-    """Array arguments of the projection by name, for rows of samples [row, end); read-only, so that
-    `BufferPool.upload` copies each once."""
+def projection_arrays(
+    views: ViewBatch, source: KernelSource, row: int, end: int
+) -> dict[str, np.ndarray | DeviceRecord]:
+    """Array arguments of the projection by name, for rows of samples [row, end); host arrays are read-only,
+    so that `BufferPool.upload` copies each once."""
     view = views.view
+    if view.device_record is not None:
+        return {"view": view.device_record}
     if view.band is not None:
         row, end = max(row, view.band[0]), min(end, view.band[1])
     arrays = {"view": view_records(views, row, end, source.records["View"])}
@@ -43,7 +48,7 @@ def projection_arrays(views: ViewBatch, source: KernelSource, row: int, end: int
         arrays["moving"] = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
     for array in arrays.values():
         array.flags.writeable = False
-    return arrays
+    return {**arrays}
 
 
 def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:

@@ -1,15 +1,14 @@
 // Normal consistency loss: rendered normals against the normals of the depth map. NumPy reference with formulas: `normal_loss` in
 // fidsplat/train/losses.py.
 
-// Unprojected point of a pixel.
-static inline float3 point_at(
-    int x, int y, int width, global const float *depth, float inverse_x, float inverse_y, float middle_x, float middle_y
-) {
-    float3 ray = {(x + 0.5f - middle_x) * inverse_x, (y + 0.5f - middle_y) * inverse_y, 1.0f};
-    return ray * depth[y * (size_t)width + x];
+// Ray through a pixel, with z = 1. lens: fx, fy, cx, cy.
+static inline float3 ray_at(int x, int y, global const float *lens) {
+    float3 ray = {(x + 0.5f - lens[2]) / lens[0], (y + 0.5f - lens[3]) / lens[1], 1.0f};
+    return ray;
 }
 
-#define POINT(x, y) point_at(x, y, width, depth, inverse_x, inverse_y, middle_x, middle_y)
+// Unprojected point of a pixel.
+#define POINT(x, y) (ray_at(x, y, lenses + 4 * row) * depth[(y) * (size_t)width + (x)])
 #define HAS_DEPTH(x, y) (depth[(y) * (size_t)width + (x)] > 0.0f)
 
 // Index space: (columns, rows). Reads: the images, the mask. Writes: the gradients with respect to normals and, for each pixel, the
@@ -53,5 +52,6 @@ kernel void surface_depths(
     if (y + 1 < height) by -= vload3(2 * (at + width), differences);
     if (x > 0) by += vload3(2 * (at - 1) + 1, differences);
     if (x + 1 < width) by -= vload3(2 * (at + 1) + 1, differences);
-    grad_depth[at] = (x + 0.5f - middle_x) * inverse_x * by.x + (y + 0.5f - middle_y) * inverse_y * by.y + by.z;
+    float3 ray = ray_at(x, y, lenses + 4 * row);
+    grad_depth[at] = ray.x * by.x + ray.y * by.y + by.z;
 }
