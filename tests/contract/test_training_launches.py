@@ -138,8 +138,8 @@ def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoi
     trainer.save_checkpoint()
     contents, loss, views = file.read_bytes(), trainer._model.loss, []
 
-    def failing(images, view, exposure):
-        value, slope = loss(images, view, exposure)
+    def failing(images, view):
+        value, slope = loss(images, view)
         views.append(dataset.views[view].name)
         if len(views) == 4:
             value = lambda: Loss(math.nan, 0.1)  # noqa: E731
