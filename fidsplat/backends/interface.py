@@ -246,7 +246,7 @@ class Pipeline(ABC):
         raise NotImplementedError
 
     def fits(self, resident: Any, view: View) -> bool:
-        """Whether the frame fits the memory budget without dividing the cloud into chunks."""
+        """Whether the frame fits the memory budget without projecting the cloud in slices."""
         return True
 
     def render_intermediates(self, resident: Any, view: View) -> dict[str, np.ndarray]:
@@ -263,8 +263,8 @@ class GradientPipeline(ABC):
 
         waits: whether to wait until the number of (splat, tile) pairs shows that the buffers were large
         enough. If not, `backward` may raise CapacityExceeded, and the frame must be discarded. Raises
-        DeviceError if the frame does not fit the memory budget in one piece, as a frame that is divided into
-        bands of tiles or chunks of splats has no gradient.
+        DeviceError if the frame does not fit the memory budget in one piece, as a frame that is rendered in
+        bands of tiles or projected in slices has no gradient.
         """
 
     @abstractmethod

@@ -62,7 +62,7 @@ class Renderer:
             "auto" ("opencl", else "warp" with a warning). None: the variable FIDSPLAT_DEVICE, else "auto".
         memory_budget: bytes of device memory for a frame and its cloud; by default nine tenths of the
             device's memory. Tile lists that exceed it are split into bands of tiles. OpenCL also projects
-            larger clouds in chunks, and renders in bands of rows; a larger cloud is an error on Warp.
+            larger clouds in slices, and renders in bands of rows; a larger cloud is an error on Warp.
             Smaller budgets are slower, with bit-identical images.
 
     Raises:

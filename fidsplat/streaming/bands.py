@@ -1,5 +1,5 @@
 """Row bands: a frame that does not fit on the device is rendered in bands of rows, each from its visible
-chunks. If a band cannot be split further, the device projects its splats in chunks."""
+chunks. If a band cannot be split further, the device projects its splats in slices."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@
 //   B_end = g C_behind,   B_k-1 = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k).
 // Nothing is divided by 1 - alpha, so opaque fragments need no special case.
 // The schedules (schedule/*_backward.cl) process a tile's list forward for T, with the arithmetic and decisions of blending, and
-// then backward, CHUNK splats at a time.
+// then backward, SEGMENT splats at a time.
 
 //@@ blend_types
 typedef struct {            // uniforms of the blend stage

@@ -1,5 +1,5 @@
-// Compaction for clouds that are projected in chunks: appends the visible splats of a chunk to those of preceding chunks, in
-// order. The chunk is cut into SORT_BLOCKS blocks; the host adds up their counts.
+// Compaction for clouds that are projected in slices: appends the visible splats of a slice to those of preceding slices, in
+// order. The slice is cut into SORT_BLOCKS blocks; the host adds up their counts.
 
 // Index space: one work-item per block. Reads: keys. Writes: block_counts[0 .. SORT_BLOCKS): splats of the block in this band,
 // block_counts[SORT_BLOCKS .. 2 * SORT_BLOCKS): splats of the block in any band.

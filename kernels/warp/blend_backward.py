@@ -1,7 +1,7 @@
 """Backward pass of blending (fragment_backward.py has the formulas).
 
-The list of each tile is evaluated forward again, for the transmittance in front of every CHUNK splats, then
-backward, a chunk at a time. For each splat, the sums over the tile's samples are stored at the gradient
+The list of each tile is evaluated forward again, for the transmittance in front of every SEGMENT splats, then
+backward, a segment at a time. For each splat, the sums over the tile's samples are stored at the gradient
 buffer offset of this (splat, tile) pair. There are no atomics, so sums have a fixed order and results are
 bit-identical on every run.
 
@@ -19,7 +19,7 @@ from .bounds import Bounds, make_bounds, window_tile
 from .common import STRICT, View, lowest, with_numbers
 from .fragment_backward import make_fragments
 
-CHUNK = 32
+SEGMENT = 32
 """splats of a tile's list that are evaluated forward and then backward together"""
 BLOCK_W, BLOCK_H = 8, 4
 """rows and columns of samples of a warp, one sample per thread"""
@@ -42,7 +42,7 @@ _ANY_OF_WARP = """
 """
 _SHARED_MEMORY = """
 #if defined(__CUDA_ARCH__)
-    __shared__ float parts[CHUNK * WARPS * FIELDS];
+    __shared__ float parts[SEGMENT * WARPS * FIELDS];
     return static_cast<wp::uint64>(__cvta_generic_to_shared(parts));
 #else
     return 0;
@@ -147,7 +147,7 @@ def make_blend_backward(
     )
     read, box_of, pixel_gradient_at = made.read, made.box_of, made.pixel_gradient_at
     alpha_at, fragment_gradient = made.alpha_at, made.fragment_gradient
-    numbers = {"CHUNK": CHUNK, "WARPS": max(threads // 32, 1), "FIELDS": wp.types.type_size(GradientSums)}
+    numbers = {"SEGMENT": SEGMENT, "WARPS": max(threads // 32, 1), "FIELDS": wp.types.type_size(GradientSums)}
 
     @wp.func_native(with_numbers(_ANY_OF_BLOCK, numbers))
     def any_of_block(open: bool) -> bool:
@@ -188,7 +188,7 @@ def make_blend_backward(
         barrier."""
         ...
 
-    chunk_of = wp.types.vector(CHUNK, wp.float32)
+    segment_of = wp.types.vector(SEGMENT, wp.float32)
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
     @wp.func
@@ -212,7 +212,7 @@ def make_blend_backward(
         samples: Samples,
         checkpoints: wp.array(
             dtype=wp.float32
-        ),  # scratch: transmittance in front of every CHUNK splats of a tile
+        ),  # scratch: transmittance in front of every SEGMENT splats of a tile
         gradient_sums: wp.array(dtype=GradientSums),  # out, zeroed by the caller
     ):
         view = views[0]
@@ -229,28 +229,28 @@ def make_blend_backward(
         if x >= view.width or y >= view.height:
             transmittance = 0.0
         start, end = starts[tile], starts[tile + 1]
-        own = (start / CHUNK + tile) * threads + item
+        own = (start / SEGMENT + tile) * threads + item
 
-        chunks = int(0)
-        while start + chunks * CHUNK < end and any_of_block(transmittance > view.transmittance_stop):
-            first = start + chunks * CHUNK
-            checkpoints[own + chunks * threads] = transmittance
-            for position in range(wp.min(CHUNK, end - first)):
+        segments = int(0)
+        while start + segments * SEGMENT < end and any_of_block(transmittance > view.transmittance_stop):
+            first = start + segments * SEGMENT
+            checkpoints[own + segments * threads] = transmittance
+            for position in range(wp.min(SEGMENT, end - first)):
                 box = box_of(lines, lists[first + position])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
                     s = read(lines, lists, first + position, view)
                     transmittance = transmittance_behind(
                         transmittance, alpha_at(s, x, y, transmittance, view)
                     )
-            chunks += 1
+            segments += 1
 
         parts = shared_memory()
-        while chunks > 0:
-            chunks -= 1
-            first = start + chunks * CHUNK
-            count = wp.min(CHUNK, end - first)
-            transmittance = checkpoints[own + chunks * threads]
-            transmittances, alphas = chunk_of(), chunk_of()
+        while segments > 0:
+            segments -= 1
+            first = start + segments * SEGMENT
+            count = wp.min(SEGMENT, end - first)
+            transmittance = checkpoints[own + segments * threads]
+            transmittances, alphas = segment_of(), segment_of()
             for position in range(count):
                 transmittances[position] = transmittance
                 box = box_of(lines, lists[first + position])
@@ -312,7 +312,7 @@ def make_blend_backward(
                 at = state_first + row * view.tile_w + column
                 transmittance = transmittances[at]
                 alpha = alpha_at(s, x0 + column, y0 + row, transmittance, view)
-                fragments[at * CHUNK + position] = wp.vec2(transmittance, alpha)
+                fragments[at * SEGMENT + position] = wp.vec2(transmittance, alpha)
                 if alpha != 0.0:
                     transmittances[at] = transmittance_behind(transmittance, alpha)
                     if not (transmittances[at] > view.transmittance_stop):
@@ -337,7 +337,7 @@ def make_blend_backward(
             dtype=wp.float32
         ),  # scratch of one tile from `state_first` on, as in blend_cpu
         pixel_gradients: wp.array(dtype=PixelGradient),  # scratch, as `transmittances`
-        fragments: wp.array(dtype=wp.vec2),  # scratch, CHUNK per sample: transmittance and alpha
+        fragments: wp.array(dtype=wp.vec2),  # scratch, SEGMENT per sample: transmittance and alpha
         state_first: int,
     ):
         view = views[0]
@@ -356,26 +356,26 @@ def make_blend_backward(
                 transmittances[state_first + k] = 1.0
                 alive += 1
         start, end = starts[tile], starts[tile + 1]
-        own = (start / CHUNK + tile) * area
+        own = (start / SEGMENT + tile) * area
         processed = start
         while processed < end and alive > 0:
-            chunk, position = (processed - start) / CHUNK, (processed - start) % CHUNK
+            segment, position = (processed - start) / SEGMENT, (processed - start) % SEGMENT
             if position == 0:
                 for k in range(area):
-                    checkpoints[own + chunk * area + k] = transmittances[state_first + k]
+                    checkpoints[own + segment * area + k] = transmittances[state_first + k]
             alive = attenuate(
                 processed, position, alive, x0, y0, state_first, lines, lists, transmittances, fragments, view
             )
             processed += 1
 
-        processed_end = processed  # the fragments of the last chunk are stored
+        processed_end = processed  # the fragments of the last segment are stored
         while processed > start:
-            chunk = (processed - 1 - start) / CHUNK
-            first = start + chunk * CHUNK
+            segment = (processed - 1 - start) / SEGMENT
+            first = start + segment * SEGMENT
             if processed < processed_end:
                 for k in range(area):
-                    transmittances[state_first + k] = checkpoints[own + chunk * area + k]
-                for position in range(CHUNK):
+                    transmittances[state_first + k] = checkpoints[own + segment * area + k]
+                for position in range(SEGMENT):
                     attenuate(
                         first + position,
                         position,
@@ -397,7 +397,7 @@ def make_blend_backward(
                 for row in range(touched[2], touched[3]):
                     for column in range(touched[0], touched[1]):
                         at = state_first + row * view.tile_w + column
-                        fragment = fragments[at * CHUNK + processed - first]
+                        fragment = fragments[at * SEGMENT + processed - first]
                         if fragment[1] > 0.0:
                             values, pixel_gradient = fragment_gradient(
                                 s, lists[processed], x0 + column, y0 + row, fragment[0], fragment[1],

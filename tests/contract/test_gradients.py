@@ -172,7 +172,7 @@ def long_lists():
 
 
 @pytest.mark.sweep
-def test_long_lists_are_taken_back_in_chunks(backend):
+def test_long_lists_are_taken_back_in_segments(backend):
     gradients = assert_same(backend, *long_lists())
     for shape in backend.configs("tape").values():
         again = assert_same(backend, *long_lists(), config=shape)

@@ -151,7 +151,7 @@ def whole(opencl, cloud):
 @pytest.mark.parametrize("mebibytes", [3.7, 4, 4.5])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
-    """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is. With a
+    """Slices of the cloud, bands of rows, and a cloud that is copied in slices or stays where it is. With a
     printed plane among them, so every fragment by its own depth."""
     renderer = small(opencl, mebibytes, None if streamed else cloud)
     resident = renderer.upload(cloud)
@@ -162,10 +162,10 @@ def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, stre
         assert frame.stats == whole[1]
         for name in ALL_OUTPUTS:
             assert np.array_equal(frame[name], whole[0][name]), name
-    assert "packed splats" in renderer.backend.pool._buffers, "it was drawn in chunks"
+    assert "packed splats" in renderer.backend.pool._buffers, "it was drawn in slices"
 
 
-def test_many_big_splats_in_chunks(opencl):
+def test_many_big_splats_in_slices(opencl):
     """More splats that touch many tiles than the first guess has room for."""
     crowd = random_splats(26000, seed=2, depth=(-19.0, 9.0), scale=(0.5, 3.0))
     expected = roomy(opencl).render(crowd, CAMERA, ("rgb", "depth"))
@@ -206,11 +206,16 @@ def test_plans_hold_to_the_budget():
         for budget in (2**28, 2**30, 2**34):
             for upload in (0, 52):
                 plan = plan_of(count, 80, upload, 2**27, "sort_first", budget, budget // 4)
-                held = plan.capacity * (80 + 12 + 16) + plan.chunk * (80 + 12 + upload) + budget // 8 + 2**27
-                assert held == plan.total or not plan.chunk
+                held = (
+                    plan.max_visible * (80 + 12 + 16)
+                    + plan.slice_size * (80 + 12 + upload)
+                    + budget // 8
+                    + 2**27
+                )
+                assert held == plan.total or not plan.slice_size
                 assert plan.total <= budget, (count, budget, upload, plan)
-                assert plan.capacity * 80 <= budget // 4
-                assert plan.chunk or (plan.capacity == count and not upload)
+                assert plan.max_visible * 80 <= budget // 4
+                assert plan.slice_size or (plan.max_visible == count and not upload)
 
 
 def test_views_are_rendered_like_single_frames(renderer):
@@ -244,7 +249,7 @@ def test_frames_of_many_sizes_leave_no_heap_of_buffers(opencl):
 
 @machines
 def test_a_pool_keeps_to_the_budget_whatever_was_rendered_before(opencl, machine):
-    """Images at once and in chunks, few and many outputs: buffers of one kind do not count against the
+    """Images at once and in slices, few and many outputs: buffers of one kind do not count against the
     budget of the next."""
     budget = 8 * 2**20
     renderer, opencl = machine(opencl, budget), machine(opencl)
@@ -255,7 +260,7 @@ def test_a_pool_keeps_to_the_budget_whatever_was_rendered_before(opencl, machine
         frame = renderer.render(resident, CAMERA, outputs)
         if count != 50000:  # of which a processor has room for all, a GPU not
             assert ("packed splats" in renderer.backend.pool._buffers) == (count > 50000), (
-                "it was drawn in chunks"
+                "it was drawn in slices"
             )
         assert all(np.array_equal(frame[name], expected[name]) for name in outputs)
         assert renderer.backend.pool.memory_bytes + resident.memory_bytes <= budget, count
@@ -276,7 +281,7 @@ PICTURES = {
 @pytest.mark.parametrize(
     ("name", "mebibytes", "machine"),
     alternate(
-        {name: name for name in PICTURES}, {"in chunks": 7, "at once": 64}, dict(reversed(MACHINES.items()))
+        {name: name for name in PICTURES}, {"in slices": 7, "at once": 64}, dict(reversed(MACHINES.items()))
     ),
 )
 def test_a_plan_counts_all_memory_of_a_frame(opencl, monkeypatch, machine, mebibytes, name):

@@ -196,7 +196,7 @@ def test_an_opaque_layer_ends_the_count(renderer):
     assert frame["blended"].dtype == frame["splat_id"].dtype == np.int32
 
 
-def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
+def test_splat_ids_are_indices_of_the_cloud_in_slices_too(renderer):
     cloud = random_splats(3000, 8, depth=(1.0, 6.0), scale=(1e-3, 0.3))
     full_frame = renderer.render(cloud, CAMERA, ALL)
     ids = full_frame["splat_id"]
@@ -204,8 +204,8 @@ def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     visible = ids >= 0
     assert np.array_equal(cloud.labels[ids[visible]], full_frame["label"][visible])
     if not renderer.device.name.startswith("opencl"):
-        return  # Warp renders no cloud in chunks (docs/backends.md)
-    # a GPU's tables for drawing in chunks take more
+        return  # Warp projects no cloud in slices (docs/backends.md)
+    # a GPU's tables for projection in slices take more
     budget = 1_000_000 if renderer.device.kind == "cpu" else 3_000_000
     small = fs.Renderer(renderer.device.name, memory_budget=budget)
     resident = small.upload(cloud)

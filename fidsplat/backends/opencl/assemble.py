@@ -273,7 +273,7 @@ def _assemble_backward(
     files += _dialect(config, _scalars(features), features.effects)
     files += [effect.backward_file for effect in effects.values()]
     files += [EFFECT_CODE[part].file for part in parts]
-    backward = {"BACKWARD_ITEMS": backward_items(features, config), "CHUNK": backward_chunk(features, config)}
+    backward = {"BACKWARD_ITEMS": backward_items(features, config), "SEGMENT": segment_size(features, config)}
     if name == "step":
         backward["AXES"] = 3 if "thickness" in effects else 2
     constants = build_constants(features, config) | backward
@@ -340,14 +340,14 @@ def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Itera
 
 
 def backward_items(features: FeatureSet, config: KernelConfig) -> int:
-    """Work-group size of the backward pass over a chunk of a tile's list; half for outputs other than rgb,
+    """Work-group size of the backward pass over a segment of a tile's list; half for outputs other than rgb,
     which would otherwise exceed NVIDIA's 48 KiB of local memory."""
     if config.schedule == "lanes":
         return 1
     return min(config.tile_width * config.tile_height, 128 if features.outputs else 256)
 
 
-def backward_chunk(features: FeatureSet, config: KernelConfig) -> int:
+def segment_size(features: FeatureSet, config: KernelConfig) -> int:
     """Number of splats of a tile's list that the backward pass evaluates at once."""
     if config.schedule == "lanes":
         return config.tape

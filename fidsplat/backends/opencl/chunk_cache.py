@@ -280,7 +280,7 @@ class GatheredChunks(Resident):
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         row_bytes = self._row_bytes(name)
         if self.streamed:
-            buffer = self._workspace.pool.scratch(f"chunk of {name}", (end - first) * row_bytes)
+            buffer = self._workspace.pool.scratch(f"slice of {name}", (end - first) * row_bytes)
             self._fill(name, first, end, buffer)
             return buffer
         if name not in self._buffers:

@@ -33,8 +33,8 @@ def render(frame: DeviceFrame) -> None:
         return
     frame.discard_launches()
     allocate_samples(frame)
-    if frame.plan.chunk:
-        render_in_chunks(frame)
+    if frame.plan.slice_size:
+        render_in_slices(frame)
     elif frame.config.binning == "sort_first":
         render_sort_first(frame)
     else:
@@ -117,15 +117,15 @@ def complete_bin_first(frame: DeviceFrame, counted: cl.Event, capacity: int) -> 
     resolve(frame)
 
 
-def render_in_chunks(frame: DeviceFrame) -> None:
-    """Render with a small memory budget: project the cloud in chunks, and store only visible splats; if these
+def render_in_slices(frame: DeviceFrame) -> None:
+    """Render with a small memory budget: project the cloud in slices, and store only visible splats; if these
     exceed the capacity, project again for each band of tile rows."""
     rows = [(frame.first_tile // frame.tiles_x, frame.end_tile // frame.tiles_x)]
     visible = pairs = 0
     while rows:
         top, end = rows.pop(0)
         packed = tiling.pack_visible(frame, top, end)
-        if packed.count > frame.plan.capacity:
+        if packed.count > frame.plan.max_visible:
             rows = tiling.split_rows(frame, top, end, packed.count) + rows
             continue
         tiling.sort_by_depth(frame, packed.count)

@@ -23,8 +23,8 @@ from fidsplat.backends.interface import GradientPipeline
 from fidsplat.backends.opencl.assemble import (
     assemble_gradients,
     assemble_step,
-    backward_chunk,
     backward_items,
+    segment_size,
 )
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame
@@ -143,17 +143,17 @@ class OpenCLGradients(GradientPipeline):
     def _record_blend_backward(self, frame: DeviceFrame, log_ceiling: float) -> None:
         features, config = self.features, self._pipeline.config
         in_groups, tile = config.schedule == "group", config.tile_width * config.tile_height
-        chunks = frame.pairs // backward_chunk(features, config) + frame.tiles
-        frame.scratch("checkpoints", (8 * tile if in_groups else 4 * (tile + config.lanes)) * chunks)
+        segments = frame.pairs // segment_size(features, config) + frame.tiles
+        frame.scratch("checkpoints", (8 * tile if in_groups else 4 * (tile + config.lanes)) * segments)
         if not in_groups:
             rows = -(-frame.view.height // config.tile_height)
             frame.scratch("big_rows", 4 * frame.scalars["big_capacity"] * rows)
         if count := frame.resident.count:
             frame.launch("reserve", "reserve_gradients", (count,), (_GROUP,), count=count)
-        groups = chunks if in_groups else min(frame.tiles, frame.workspace.info.compute_units)
+        groups = segments if in_groups else min(frame.tiles, frame.workspace.info.compute_units)
         if in_groups:
-            frame.scratch("reached_chunks", 4 * frame.tiles)
-            frame.scratch("chunk_tiles", 4 * chunks)
+            frame.scratch("reached_segments", 4 * frame.tiles)
+            frame.scratch("segment_tiles", 4 * segments)
             size = frame.tiles * config.blend_items
             frame.launch(
                 "blend backward", "blend_checkpoints", (size,), (config.blend_items,), log_ceiling=log_ceiling
@@ -164,12 +164,12 @@ class OpenCLGradients(GradientPipeline):
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
-        """Bytes of the struct `Tape` (schedule/lanes_backward.cl): for each pixel and
-        splat of a chunk, transmittance and alpha; then 2 * 8 * chunk + 1 words, rounded up to vectors."""
+        """Bytes of the struct `Tape` (schedule/lanes_backward.cl): per pixel and splat of a list segment,
+        transmittance and alpha; then 2 * 8 * splats + 1 words, rounded up to vectors."""
         config = self._pipeline.config
-        chunk, vector = backward_chunk(self.features, config), 4 * config.lanes
-        words = 2 * 8 * chunk + 1
-        return 8 * chunk * config.tile_width * config.tile_height + -(-4 * words // vector) * vector
+        splats, vector = segment_size(self.features, config), 4 * config.lanes
+        words = 2 * 8 * splats + 1
+        return 8 * splats * config.tile_width * config.tile_height + -(-4 * words // vector) * vector
 
     def compile_step(self, with_camera: bool = False) -> None:
         """Compile the kernel of `step`, which gradients do not need."""

@@ -235,7 +235,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
             "in uint gradient_offsets big_rows",
         ),
         _BLENDED,
-        "out float checkpoints  // transmittance of each tile in front of every CHUNK splats",
+        "out float checkpoints  // transmittance of each tile in front of every SEGMENT splats",
         "out float record_gradients  // records RecordGradient by gradient buffer offset",
         "out real background_sums  // (tiles, 3) with respect to the background",
         "out float tapes  // a Tape for each work-item",
@@ -387,14 +387,14 @@ GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "blend_checkpoints": args(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
-        "out float checkpoints  // per pixel and CHUNK splats: T in front, gradient with respect to T behind",
-        "out uint reached_chunks  // (tiles) number of chunks before the transmittance stop",
-        "out uint chunk_tiles  // tile of each chunk",
+        "out float checkpoints  // by pixel and segment: T in front, gradient with respect to T behind",
+        "out uint reached_segments  // (tiles) number of segments before the transmittance stop",
+        "out uint segment_tiles  // tile of each segment",
         "out real background_sums  // (tiles, 3) with respect to the background",
     ),
     "blend_backward": args(
         *("in Splat splats", "in uint lists starts", _TILES, "in uint gradient_offsets", _BLENDED),
-        *("in float checkpoints", "in uint reached_chunks chunk_tiles"),
+        *("in float checkpoints", "in uint reached_segments segment_tiles"),
         "out float record_gradients  // records RecordGradient by gradient buffer offset",
     ),
 }

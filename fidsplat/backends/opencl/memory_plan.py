@@ -1,8 +1,9 @@
 """The memory plan: how a frame or batch is divided to fit the memory budget.
 
 A frame is rendered in one piece if its buffers fit. If only its (splat, tile) pairs exceed the budget, it is
-binned and blended in bands of tiles. As the last resort the cloud is projected in chunks, of which only
-visible splats are stored. A batch is rendered in parts of as many views as fit.
+binned and blended in bands of tiles. As the last resort the cloud is projected in slices (ranges of
+consecutive splats), of which only visible splats are stored. A batch is rendered in parts of as many views as
+fit.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError, bytes_words
 
-DEFAULT_CHUNK = 1 << 20
-"""splats of a chunk; a power of two, so that the chunks of every array start at aligned addresses"""
-_MAX_CHUNK = 1 << 23
-"""splats up to which chunks are enlarged if memory is ample, for fewer launches"""
-_MIN_CHUNK = 1 << 10
+DEFAULT_SLICE = 1 << 20
+"""splats of a slice; a power of two, so that the slices of every array start at aligned addresses"""
+_MAX_SLICE = 1 << 23
+"""splats up to which slices are enlarged if memory is ample, for fewer launches"""
+_MIN_SLICE = 1 << 10
 KEY_BYTES, WINDOW_BYTES, SORT_BYTES = 4, 8, 16
 """bytes per splat of sort keys, of tile windows, and of keys and indices during the sort"""
 MIN_BIG = 1 << 12
@@ -49,10 +50,10 @@ _CAMERA_UNIFORMS = {"ray", "vignette_center"}
 class MemoryPlan:
     """Division of a frame, or of a part of a batch, and the bytes of its buffers."""
 
-    chunk: int
+    slice_size: int
     """number of splats that are projected at once; 0: all, without packing the visible splats"""
-    capacity: int
-    """maximum visible splats of one band, if the cloud is projected in chunks"""
+    max_visible: int
+    """maximum visible splats of a band of rows, if the cloud is projected in slices"""
     total: int
     """total bytes including the cloud; exceeded only by frames with more than `MIN_BIG` big splats"""
 
@@ -119,7 +120,7 @@ class MemoryPlanner:
         external = views.view.external_depth
         batched = views.stacked and not (resident.streamed or self._one_by_one)
         batched = batched and not (external and external.stacked)
-        if plan.chunk or not batched or (views.camera_parameters and self._has_camera_uniforms):
+        if plan.slice_size or not batched or (views.camera_parameters and self._has_camera_uniforms):
             for k in range(count):
                 yield Part(k, k + 1, self.frame(resident, views.view_at(k), other_images))
             return
@@ -165,19 +166,20 @@ def plan_of(
     if fits and count * record_bytes <= limit:
         return MemoryPlan(0, count, fixed_bytes + splat_bytes + pair_bytes)
     free = budget - fixed_bytes - pair_bytes
-    # chunks are enlarged while they take less than 1/64 of the free memory, and reduced above 1/8; the rest
+    # slices are enlarged while they take less than 1/64 of the free memory, and reduced above 1/8; the rest
     # is for visible splats
-    chunk, chunked_bytes = DEFAULT_CHUNK, projected_bytes + upload_bytes
-    while chunk < _MAX_CHUNK and chunk * chunked_bytes < free // 64:
-        chunk *= 2
-    while chunk > _MIN_CHUNK and (chunk * chunked_bytes > free // 8 or chunk > 2 * count):
-        chunk //= 2
-    capacity = (free - chunk * chunked_bytes) // (projected_bytes + SORT_BYTES)
-    capacity = min(capacity, limit // record_bytes, count)
-    if capacity < min(_MIN_CHUNK, count):
+    slice_size, sliced_bytes = DEFAULT_SLICE, projected_bytes + upload_bytes
+    while slice_size < _MAX_SLICE and slice_size * sliced_bytes < free // 64:
+        slice_size *= 2
+    while slice_size > _MIN_SLICE and (slice_size * sliced_bytes > free // 8 or slice_size > 2 * count):
+        slice_size //= 2
+    max_visible = (free - slice_size * sliced_bytes) // (projected_bytes + SORT_BYTES)
+    max_visible = min(max_visible, limit // record_bytes, count)
+    if max_visible < min(_MIN_SLICE, count):
         raise DeviceError(
             f"memory_budget must exceed the {bytes_words(fixed_bytes)} of the frame and the cloud without "
             f"lists, got {bytes_words(budget)}; raise it, or render a smaller frame or fewer outputs"
         )
-    total = fixed_bytes + pair_bytes + chunk * chunked_bytes + capacity * (projected_bytes + SORT_BYTES)
-    return MemoryPlan(chunk, capacity, total)
+    total = fixed_bytes + pair_bytes + slice_size * sliced_bytes
+    total += max_visible * (projected_bytes + SORT_BYTES)
+    return MemoryPlan(slice_size, max_visible, total)

@@ -93,11 +93,11 @@ class OpenCLPipeline(Pipeline):
                 culling = self._pipeline_for(self.features, replace(self.config, culls_first=True))
                 return culling.render_view(resident, view)
             plan = self._planner.frame(resident, view)
-            if plan.chunk and self.config.binning != "sort_first":
-                # frames in chunks use only this strategy; it is the fastest with little memory
+            if plan.slice_size and self.config.binning != "sort_first":
+                # frames in slices use only this strategy; it is the fastest with little memory
                 return self._with_binning("sort_first").render_view(resident, view)
             frame = self._render_planned(resident, view, plan)
-            complete = not (plan.chunk or frame.in_bands or view.sub_frames or view.band)
+            complete = not (plan.slice_size or frame.in_bands or view.sub_frames or view.band)
             if complete and resident.count and not resident.streamed:
                 self._cache(resident, key, frame)
             return OpenCLImages(self, view, [frame.rendered()], resident.count)
@@ -125,22 +125,22 @@ class OpenCLPipeline(Pipeline):
 
     def fits(self, resident: Resident, view: View) -> bool:
         try:
-            return not self._planner.frame(resident, view).chunk
+            return not self._planner.frame(resident, view).slice_size
         except DeviceError:  # too little memory even for a divided frame
             return False
 
     def render_undivided(self, resident: Resident, view: View) -> DeviceFrame:
-        """Render one frame without chunks and bands; returns its buffers, valid until the next frame. Raises
+        """Render one frame without slices and bands; returns its buffers, valid until the next frame. Raises
         DeviceError if it exceeds the memory budget."""
         if self._is_too_small_to_vectorise(resident):
             return self._unvectorised.render_undivided(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
-            if not plan.chunk:
+            if not plan.slice_size:
                 frame = self._render_planned(resident, view, plan)
             if frame is None or frame.pairs > self.workspace.pair_budget:
                 raise DeviceError(
-                    "frames with derivatives must fit the memory budget without chunks or bands, got "
+                    "frames with derivatives must fit the memory budget without slices or bands, got "
                     f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller frames"
                 )
             return frame
@@ -166,7 +166,7 @@ class OpenCLPipeline(Pipeline):
             plan = self._planner.frame(resident, view)
             buffers = self._buffer_key(resident, view, plan)
             workspace.pool.trim(buffers, workspace.memory_budget - plan.total, resident.capacity)
-            if plan.chunk or not tiling.pair_capacity(workspace, self.config):
+            if plan.slice_size or not tiling.pair_capacity(workspace, self.config):
                 return self.render_undivided(resident, view)
             resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
             commands = CommandList(self.program) if recorded is None else recorded.commands
@@ -236,7 +236,7 @@ class OpenCLPipeline(Pipeline):
 
     def _buffer_key(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
         """Key of frames with equal buffer sizes."""
-        shared = resident.buffer_key if not plan.chunk else None
+        shared = resident.buffer_key if not plan.slice_size else None
         return self, view.width, view.height, shared or (resident.capacity, plan)
 
     def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
@@ -280,8 +280,8 @@ class OpenCLPipeline(Pipeline):
         """The pipeline with the fastest tile-binning strategy for a part of a batch."""
         if self.config.binning != "bin_first":
             return self
-        if plan.chunk:
-            return self._with_binning("sort_first")  # the only strategy of frames in chunks
+        if plan.slice_size:
+            return self._with_binning("sort_first")  # the only strategy of frames in slices
         few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
         return self._with_binning("bin_local") if few or resident.is_spatially_sorted else self
 

@@ -28,13 +28,13 @@ class Resident(ResidentData):
     """Base class of clouds on an OpenCL device."""
 
     streamed = False
-    """whether every frame copies the cloud to the device, a chunk at a time"""
+    """whether every frame copies the cloud to the device, a slice at a time"""
     immutable = True
     """whether the arrays never change, so that a frame can be rendered again later"""
     buffer_key: object = None
     """key of clouds whose frames may share buffers"""
     is_spatially_sorted = False
-    """whether splats with neighbouring indices are close to each other, as in chunked scenes on disk"""
+    """whether splats with neighbouring indices are close to each other, as in stores"""
     sortable = False
     """whether `sorted_array` is available"""
 
@@ -135,9 +135,9 @@ class UploadedCloud(Resident):
             self._buffers.clear()
             self.cached_frames.clear()
         if self.streamed:
-            chunk = np.ascontiguousarray(self._array(name)[first:end])
-            buffer = self._workspace.pool.scratch(f"chunk of {name}", chunk.nbytes)
-            cl.enqueue_copy(self._workspace.queue, buffer, chunk)
+            part = np.ascontiguousarray(self._array(name)[first:end])
+            buffer = self._workspace.pool.scratch(f"slice of {name}", part.nbytes)
+            cl.enqueue_copy(self._workspace.queue, buffer, part)
             return buffer
         return self._region(self._buffer(name), first, end, self._array(name).nbytes // max(self.count, 1))
 

@@ -1,11 +1,11 @@
 """Tile binning: the splats of each tile, in depth order.
 
-`sort_first` (CPUs, and all devices for projection in chunks): all visible splats are sorted by depth, then
+`sort_first` (CPUs, and all devices for projection in slices): all visible splats are sorted by depth, then
 appended to tile lists in that order, by counting sorts over a few contiguous blocks: long sequential loops,
 no atomics. `bin_first` (GPU): the projection counts the splats of each tile, (splat, tile) pairs are written
 in any order, and each tile's list is sorted in local memory. `bin_local`: like `bin_first`, with counters in
-local memory, for many small views and for chunked scenes on disk, where atomics of neighbouring splats on one
-tile's counter would serialise.
+local memory, for many small views and for stores, where atomics of neighbouring splats on one tile's counter
+would serialise.
 """
 
 from __future__ import annotations
@@ -187,45 +187,47 @@ def _prefix_sums(
     return starts
 
 
-# with a small memory budget: project in chunks, and store only the visible splats
+# with a small memory budget: project in slices, and store only the visible splats
 
 
 class PackedCounts(NamedTuple):
-    """Numbers of splats after the projection in chunks, for a band of rows."""
+    """Numbers of splats after the projection in slices, for a band of rows."""
 
     count: int
-    """number of stored splats; an estimate if it exceeds the capacity"""
+    """number of stored splats; an estimate if it exceeds `MemoryPlan.max_visible`"""
     visible: int
-    """visible splats of the complete frame in the chunks projected so far"""
+    """visible splats of the complete frame in the slices projected so far"""
 
 
 def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
-    """Project in chunks, and pack the visible splats of tile rows [top, end)."""
+    """Project in slices, and pack the visible splats of tile rows [top, end)."""
     height, plan = frame.config.tile_height, frame.plan
     frame.upload_view(top * height, end * height)
     big = 0
     while True:
         allocate_counters(frame, COUNTERS, big)
         sizes = {"splats": frame.source.records["Splat"].itemsize, "keys": KEY_BYTES, "windows": WINDOW_BYTES}
-        packed = {name: frame.scratch(f"packed {name}", size * plan.capacity) for name, size in sizes.items()}
-        counts, big = _pack_chunks(frame, packed)
+        packed = {
+            name: frame.scratch(f"packed {name}", size * plan.max_visible) for name, size in sizes.items()
+        }
+        counts, big = _pack_slices(frame, packed)
         if big <= frame.scalars["big_capacity"]:
             break
         big *= 2
-    if counts.count <= plan.capacity:
+    if counts.count <= plan.max_visible:
         for name, buffer in packed.items():
             frame.bind(name, buffer)
     return counts
 
 
-def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[PackedCounts, int]:
-    """Project and pack chunks until a capacity is exceeded. Returns the packed splats, and the number of big
+def _pack_slices(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[PackedCounts, int]:
+    """Project and pack slices until a capacity is exceeded. Returns the packed splats, and the number of big
     splats if it exceeded the capacity, else 0."""
-    count, chunk, blocks = frame.resident.count, frame.plan.chunk, frame.config.sort_blocks
+    count, size, blocks = frame.resident.count, frame.plan.slice_size, frame.config.sort_blocks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0
-    for start in range(0, count, chunk):
-        stop = min(start + chunk, count)
+    for start in range(0, count, size):
+        stop = min(start + size, count)
         project(frame, start, stop)
         frame.scratch("block_counts", 8 * blocks)
         frame.launch("project", "pack_count", (blocks,), (1,), count=stop - start)
@@ -233,7 +235,7 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
         visible += int(counts[1].sum())
         offsets = np.concatenate([[0], np.cumsum(counts[0])]) + total
         total = int(offsets[-1])
-        if total > frame.plan.capacity:
+        if total > frame.plan.max_visible:
             return PackedCounts(-(-total * count // stop), visible), 0
         big = int(frame.read("counters", np.uint32, (COUNTERS,))[BIG])
         if big > frame.scalars["big_capacity"]:
@@ -244,15 +246,16 @@ def _pack_chunks(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[Pack
 
 
 def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple[int, int]]:
-    """Split tile rows [top, end) with `count` splats into bands that probably fit the capacity."""
-    capacity = frame.plan.capacity
+    """Split tile rows [top, end) with `count` visible splats into bands that probably have at most
+    `MemoryPlan.max_visible` each."""
+    max_visible = frame.plan.max_visible
     if end - top == 1:
         raise DeviceError(
-            f"the splats of a row of tiles must be at most {capacity:,} within the memory budget, got "
+            f"the splats of a row of tiles must be at most {max_visible:,} within the memory budget, got "
             f"{count:,}; raise memory_budget or render fewer splats"
         )
-    parts = min(max(2, -(-count * 11 // (10 * capacity))), end - top)
-    cuts = np.linspace(top, end, parts + 1).round().astype(int).tolist()
+    bands = min(max(2, -(-count * 11 // (10 * max_visible))), end - top)
+    cuts = np.linspace(top, end, bands + 1).round().astype(int).tolist()
     return list(pairwise(cuts))
 
 

@@ -121,8 +121,8 @@ class _Backward:
         gradient_sums.zero_()
         config = frame.program.config
         area = config.tile_width * config.tile_height
-        chunk = kernels("blend_backward").CHUNK
-        checkpoints = area * (pairs // chunk + frame.tiles + 1)
+        segment_size = kernels("blend_backward").SEGMENT
+        checkpoints = area * (pairs // segment_size + frame.tiles + 1)
         self._arguments["checkpoints"] = self._exact("checkpoints", checkpoints, wp.float32)
         kernel, tiles = made.blend.kernel, frame.tiles
         if config.schedule == "group":
@@ -132,7 +132,7 @@ class _Backward:
         states = self._launcher.parts * area
         self._arguments["transmittances"] = self._exact("transmittances", states, wp.float32)
         self._arguments["pixel_gradients"] = self._exact("pixel_gradients", states, made.blend.PixelGradient)
-        self._arguments["fragments"] = self._exact("fragments", states * chunk, wp.vec2)
+        self._arguments["fragments"] = self._exact("fragments", states * segment_size, wp.vec2)
         self._launcher.launch_blocks(kernel, 0, tiles, self._arguments, area=area)
 
     def _sum_rows(self, parts: Any, rows: int, columns: int, result: Any) -> None:

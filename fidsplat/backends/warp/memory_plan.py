@@ -55,7 +55,7 @@ class MemoryPlanner:
             raise DeviceError(
                 f"memory_budget must exceed the {bytes_words(fixed)} of the frame and its {resident.count:,} "
                 f"splats without lists, got {bytes_words(workspace.memory_budget)}; raise it, or use an "
-                "OpenCL device, which renders a cloud in chunks"
+                "OpenCL device, which projects a cloud in slices"
             )
         return min(workspace.pair_budget, pairs)
 

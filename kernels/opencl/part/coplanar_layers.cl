@@ -68,14 +68,14 @@ static inline Layer no_layer(void) {
         for (int block = 0; block < BLOCKS; block++) layers_start(&pixels[block], layers + block);
     float layer_depths[BLOCKS + LANES] __attribute__((aligned(64)));   // of each block: behind them no fragment belongs to this pass
     const float *until = 0;                                 // these depths, once all layers are complete
-//@ chunk_of_layers
-        // splats of groups have chunks of their own
+//@ segment_of_layers
+        // splats of groups have segments of their own
         if (pixels[0].layers) {
-            if (splats[lists[chunk]].group >= 0) until = 0;
+            if (splats[lists[segment]].group >= 0) until = 0;
             else if (!until) until = blocks_until(pixels, &constants, layer_depths);
-            while (!until && splats[lists[chunk + length - 1]].group < 0) length--;
+            while (!until && splats[lists[segment + length - 1]].group < 0) length--;
         }
-//@ chunk_of_layers_sorted
+//@ segment_of_layers_sorted
         if (pixels[0].layers) {
             if (splats[lists[positions[0]]].group >= 0) until = 0;
             else if (!until) until = blocks_until(pixels, &constants, layer_depths);

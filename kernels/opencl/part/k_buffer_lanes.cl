@@ -3,18 +3,18 @@
 // fragment replaces it or is pushed out; the fragment pushed out can nearly always be composited, else it enters a queue that is
 // sorted per pixel. All fragments take the same path, so branches are predictable.
 //
-// A tile's list is processed in chunks, and a chunk block by block: the k-buffer of a block stays in the cache, and each block sorts
-// the chunk's splats by their minimum depth there, which is mostly the order of their fragments. Two measures keep the queue short
+// A tile's list is processed in segments, and a segment block by block: the k-buffer of a block stays in the cache, and each block sorts
+// the segment's splats by their minimum depth there, which is mostly the order of their fragments. Two measures keep the queue short
 // where splats are large, and cost nothing where they are small:
-// - Deferral: where many splats of a chunk are behind the next splat of the list (their nearest points are in other tiles), they
-//   are deferred and form chunks in the order of their minimum depths in the tile, once no unread splat is nearer.
+// - Deferral: where many splats of a segment are behind the next splat of the list (their nearest points are in other tiles), they
+//   are deferred and form segments in the order of their minimum depths in the tile, once no unread splat is nearer.
 // - Lookahead: where many fragments are queued at a block, the depths of the next splats are evaluated before blending, so that
 //   the bound at each pixel is the exact depth of the next fragment.
 // Neither changes the order of fragments, which is by depth, then by position in the list.
 //@ blend_types
-#define CHUNK 128                   // splats; a multiple of 64 and a power of two
+#define SEGMENT 128                   // splats; a multiple of 64 and a power of two
 #define DEFERRED_CAPACITY 2048                  // deferred splats; when full, the nearest are processed early
-#define DEFER_THRESHOLD (CHUNK / 4)            // splats of a chunk behind the next one, from which on the tile defers
+#define DEFER_THRESHOLD (SEGMENT / 4)            // splats of a segment behind the next one, from which on the tile defers
 #define LOOKAHEAD_QUEUE 4                     // queued fragments of a block, from which on lookahead is used
 #define LOOKAHEAD_FACTOR 4                   // splats evaluated per splat required, to amortise lookahead
 #define EMPTY_Z INFINITY            // depth of an empty lane of the queue
@@ -54,18 +54,18 @@ static inline void queue_start(Queue *queue) {
 static inline vint in_order(vint bits) { return bits ^ ((bits >> 31) & 0x7FFFFFFF); }
 
 // Sort key of a depth, rounded down like depths in blocks.
-static inline uint rounded_key(blend_real depth) { return sortable((float)depth) & -CHUNK; }
+static inline uint rounded_key(blend_real depth) { return sortable((float)depth) & -SEGMENT; }
 
 // Rounded sort key of the minimum depth in `blocks`; keys: depths of a splat in each block.
 static inline uint min_key(const int *keys, uint blocks) {
     int min_depth = 0x7FFFFFFF;
     for (; blocks != 0; blocks &= blocks - 1) min_depth = min(min_depth, keys[31 - clz((int)(blocks & -blocks))]);
-    return ((uint)min_depth & -CHUNK) ^ 0x80000000u;
+    return ((uint)min_depth & -SEGMENT) ^ 0x80000000u;
 }
 
-// Inserts `taken` distinct keys, at most CHUNK, into the `count` sorted keys of `deferred`, largest first. Returns the new count.
+// Inserts `taken` distinct keys, at most SEGMENT, into the `count` sorted keys of `deferred`, largest first. Returns the new count.
 static inline int insert_deferred(ulong *deferred, int count, const ulong *batch, int taken) {
-    ulong sorted[CHUNK];
+    ulong sorted[SEGMENT];
     for (int k = 0; k < taken; k++) {
         int before = 0;
         for (int other = 0; other < taken; other++) before += batch[other] > batch[k];
@@ -85,37 +85,37 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
 //@ blocks_parameters
                                    , int which, int *keys
 //@ blocks_nearest_stored
-        VSTORE((in_order(VAS_INT(min_depth)) & -CHUNK) | which, keys + first);
+        VSTORE((in_order(VAS_INT(min_depth)) & -SEGMENT) | which, keys + first);
 //@ tile_loop
     ulong deferred[DEFERRED_CAPACITY];         // (minimum depth in the tile, position), farthest first
     int deferred_count = 0;
     bool ordered = false;       // all further splats are deferred
     for (uint read = starts[tile] - base, end = starts[tile + 1] - base; (read < end || deferred_count > 0) && alive;) {
-        uint positions[CHUNK], listed[CHUNK], length = 0;      // positions in the list, and splat indices
-        // read a chunk, unless a full chunk of deferred splats is in front of all unread splats
-        const bool reads = read < end && deferred_count <= DEFERRED_CAPACITY - CHUNK
-                           && (deferred_count < CHUNK
-                               || deferred[deferred_count - CHUNK] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
+        uint positions[SEGMENT], listed[SEGMENT], length = 0;      // positions in the list, and splat indices
+        // read a segment, unless a full segment of deferred splats is in front of all unread splats
+        const bool reads = read < end && deferred_count <= DEFERRED_CAPACITY - SEGMENT
+                           && (deferred_count < SEGMENT
+                               || deferred[deferred_count - SEGMENT] >= (ulong)rounded_key(splats[lists[read]].nearest) << 32);
         if (reads)
-            for (; length < CHUNK && read < end; length++) positions[length] = read++;
+            for (; length < SEGMENT && read < end; length++) positions[length] = read++;
         else
-            for (; length < CHUNK && deferred_count > 0; length++) positions[length] = (uint)deferred[--deferred_count];
+            for (; length < SEGMENT && deferred_count > 0; length++) positions[length] = (uint)deferred[--deferred_count];
         blend_real rest_nearest = read < end ? splats[lists[read]].nearest : INFINITY;
         if (!reads && deferred_count > 0) rest_nearest = fmin(rest_nearest, key_depth((uint)(deferred[deferred_count - 1] >> 32)));
-//@@ chunk_of_layers_sorted
+//@@ segment_of_layers_sorted
         for (uint which = 0; which < length; which++) listed[which] = lists[positions[which]];
         // touched[splat]: bit mask of the blocks that it overlaps. keys[splat][block]: its minimum depth in the block, whose low bits
-        // are replaced by the splat's index in the chunk.
-        int touched[CHUNK] __attribute__((aligned(64))), keys[CHUNK][BLOCKS] __attribute__((aligned(64)));
+        // are replaced by the splat's index in the segment.
+        int touched[SEGMENT] __attribute__((aligned(64))), keys[SEGMENT][BLOCKS] __attribute__((aligned(64)));
         uint behind = 0;
-        for (int at = 0; at < CHUNK; at += LANES) VSTORE((vint)0, touched + at);
+        for (int at = 0; at < SEGMENT; at += LANES) VSTORE((vint)0, touched + at);
         for (uint which = 0; which < length; which++) {
             global const Splat *lookahead = splats + listed[min(which + PREFETCH_SPLATS, length - 1)];
             PREFETCH(lookahead);
             PREFETCH((global const char *)lookahead + 64);
             const Splat s = splats[listed[which]];
             behind += s.z_center >= rest_nearest;
-            const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -CHUNK) | (int)which;
+            const vint key = (in_order(VAS_INT((vfloat)s.nearest)) & -SEGMENT) | (int)which;
             for (int first = 0; first < BLOCKS; first += LANES) VSTORE(key, keys[which] + first);
             touched[which] = (int)touched_blocks(&s, x0, y0, s.log_opacity - constants.log_alpha_cutoff, constants.sample_area
 //@@ blocks_arguments
@@ -123,7 +123,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         }
         // splats behind by their centre: test the minimum depth in this tile
         if (reads && (ordered || behind > DEFER_THRESHOLD)) {
-            ulong batch[CHUNK];
+            ulong batch[SEGMENT];
             int taken = 0, far = 0;
             for (uint which = 0; which < length; which++) {
                 const uint blocks = (uint)touched[which] & alive;
@@ -141,8 +141,8 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
             const int block = 31 - clz((int)(blocks & -blocks));
             // the block's splats, sorted by these keys: a rank is the number of smaller keys
-            int unsorted[CHUNK + LANES] __attribute__((aligned(64))), sorted[CHUNK + 1 + LANES] __attribute__((aligned(64))), count = 0;
-            for (int first = 0; first < CHUNK; first += 64) {
+            int unsorted[SEGMENT + LANES] __attribute__((aligned(64))), sorted[SEGMENT + 1 + LANES] __attribute__((aligned(64))), count = 0;
+            for (int first = 0; first < SEGMENT; first += 64) {
                 ulong own = 0;
                 for (int at = 0; at < 64; at += LANES)
                     own |= (ulong)VBITS(VMASK((VLOAD(touched + first + at) & (int)(1u << block)) != 0)) << at;
@@ -156,10 +156,10 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
                 for (int lane = 0; lane < min(count - first, LANES); lane++) sorted[((int *)&ranks)[lane]] = unsorted[first + lane];
             }
             sorted[count] = 0x7F800000;         // infinity
-            blend_real nearest[CHUNK + LANES];        // nearest[k]: lower bound of the depths of all fragments after splat k
+            blend_real nearest[SEGMENT + LANES];        // nearest[k]: lower bound of the depths of all fragments after splat k
             for (int first = 0; first < count; first += LANES)
-                VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -CHUNK)), (vfloat)rest_nearest), nearest + first);
-            vfloat depths[CHUNK];               // per pixel, for splats before `evaluated`
+                VSTORE(VMIN(VAS_FLOAT(in_order(VLOAD(sorted + first + 1) & -SEGMENT)), (vfloat)rest_nearest), nearest + first);
+            vfloat depths[SEGMENT];               // per pixel, for splats before `evaluated`
             Pixel pixel = pixels[block];
             // Lookahead: evaluates depths from `lookahead` back to the splat after `next`, up to the last splat that may be nearer than
             // `farthest`, the bound of fragments that can be pushed out.
@@ -177,7 +177,7 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
                         depths[lookahead] = nearest[lookahead];
                     }
                 }
-                const int which = sorted[lookahead] & (CHUNK - 1);
+                const int which = sorted[lookahead] & (SEGMENT - 1);
                 const Splat s = splats[listed[which]];
                 blend_real half_r2 = s.log_opacity - constants.log_alpha_cutoff;
 //@ tile_loop_end

@@ -1,5 +1,5 @@
 // Backward pass of blending for GPUs, in two kernels. `blend_checkpoints` loops over each tile's list once, front to back, and stores a
-// checkpoint per pixel and CHUNK splats: the transmittance in front of them, and the gradient with respect to the one behind. Chunks are
+// checkpoint per pixel and SEGMENT splats: the transmittance in front of them, and the gradient with respect to the one behind. Segments are
 // then independent: each work-group of `blend_backward` processes one, so that long lists occupy many groups. Sums over
 // work-items are per splat, in a fixed order and without atomics.
 // Barriers are only where the complete group reaches them.
@@ -51,7 +51,7 @@ static inline blend_real forward_fragment(const Splat *s, int px, int py, Pixel 
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
 // Reads:  splats, lists, starts[tiles + 1], and the gradients of the images.
-// Writes: checkpoints of all pixels ; reached_chunks, chunk_tiles; background_sums.
+// Writes: checkpoints of all pixels ; reached_segments, segment_tiles; background_sums.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints(
 //@@ arguments blend_checkpoints
 ) {
@@ -71,8 +71,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     uint cell = cell_y * CELLS_X + cell_x;
     int column = (int)(cell_x * CELL_W + cell_item % CELL_W), top = (int)(cell_y * CELL_H + cell_item / CELL_W * ROWS);
     int px = x0 + column, py = y0 + top;
-    uint start = starts[tile_index], end = starts[tile_index + 1], first_chunk = start / CHUNK + tile_index;
-    for (uint k = first_chunk + item; k <= end / CHUNK + tile_index; k += GROUP) chunk_tiles[k] = tile_index;
+    uint start = starts[tile_index], end = starts[tile_index + 1], first_segment = start / SEGMENT + tile_index;
+    for (uint k = first_segment + item; k <= end / SEGMENT + tile_index; k += GROUP) segment_tiles[k] = tile_index;
 
     PixelGradient gradients[ROWS];
     Pixel pixels[ROWS];
@@ -91,8 +91,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         transmittances[row] = pixels[row].t;
         grad_weights[row] = 0.0f;
     }
-    global float2 *checkpoint = (global float2 *)checkpoints + (size_t)first_chunk * PIXELS + top * TILE_W + column;
-    uint chunk = 0, last_reached = 0;        // current chunk; number of chunks that transmittance reaches at this work-item's pixels
+    global float2 *checkpoint = (global float2 *)checkpoints + (size_t)first_segment * PIXELS + top * TILE_W + column;
+    uint segment = 0, last_reached = 0;        // current segment; number of segments that transmittance reaches at this work-item's pixels
     if (item == 0) max_reached = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
 
@@ -113,7 +113,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, cell_item, length, touched[cell], cell_splats[cell]);
         if (!unfinished) listed = 0;
-        uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // number of chunks up to the end of the batch
+        uint beyond = (batch - start + length + SEGMENT - 1) / SEGMENT;      // number of segments up to the end of the batch
         for (uint k = 0; k <= listed; k += UNROLL) {
             // evaluated in parallel, since they do not depend on transmittance; attenuation is sequential
             uint which[UNROLL];
@@ -124,11 +124,11 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
                 for (int row = 0; row < ROWS; row++) values[next][row] = fragment_values(&s, px, py + row, &gradients[row], &constants);
             }
             for (int next = 0; next < UNROLL; next++) {
-                // completed chunks
-                for (uint to = k + next < listed ? (batch - start + which[next]) / CHUNK : beyond; chunk < to; chunk++)
+                // completed segments
+                for (uint to = k + next < listed ? (batch - start + which[next]) / SEGMENT : beyond; segment < to; segment++)
                     for (int row = 0; row < ROWS; row++) {
-                        checkpoint[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(transmittances[row], grad_weights[row]);
-                        if (transmittances[row] > transmittance_stop) last_reached = chunk + 1;
+                        checkpoint[(size_t)segment * PIXELS + row * TILE_W] = (float2)(transmittances[row], grad_weights[row]);
+                        if (transmittances[row] > transmittance_stop) last_reached = segment + 1;
                         transmittances[row] = pixel_transmittance(&pixels[row]);
                         grad_weights[row] = 0.0f;
                     }
@@ -143,7 +143,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     }
     atomic_max(&max_reached, last_reached);
     barrier(CLK_LOCAL_MEM_FENCE);
-    // gradient with respect to the transmittance behind each chunk; for terminated pixels, that of the background
+    // gradient with respect to the transmittance behind each segment; for terminated pixels, that of the background
     for (int row = 0; row < ROWS; row++) {
         vfloat behind = gradients[row].behind, transmitted_behind = pixels[row].t * behind;
         for (int last = (int)max_reached - 1; last >= 0; last -= PREFETCH_CHUNKS) {
@@ -166,7 +166,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     parts[PARTS + item] = behind_g;
     parts[2 * PARTS + item] = behind_b;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) reached_chunks[tile_index] = max_reached;
+    if (item == 0) reached_segments[tile_index] = max_reached;
     if (item < 3) {
         real sum = 0;
         for (uint other = 0; other < GROUP; other++) sum += parts[item * PARTS + other];
@@ -183,29 +183,29 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
 #define PATCH_H (4 * PIXELS_PER_ITEM)
 #define PATCHES_X (TILE_W / PATCH_W)
 #define PATCHES (PIXELS / (PATCH_W * PATCH_H))
-#define SHARE_OF_SPLAT (GROUP / CHUNK)       // work-items that sum a splat's fragments
+#define SHARE_OF_SPLAT (GROUP / SEGMENT)       // work-items that sum a splat's fragments
 #define STRIDE (PIXELS + TILE_W)             // per splat: more than PIXELS, against bank conflicts
-#define SCRATCH (2 * CHUNK * STRIDE > PARTS * FIELDS ? 2 * CHUNK * STRIDE : PARTS * FIELDS)
+#define SCRATCH (2 * SEGMENT * STRIDE > PARTS * FIELDS ? 2 * SEGMENT * STRIDE : PARTS * FIELDS)
 
-// Index space: work-groups of GROUP, one per chunk of a tile's list.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, gradient_offsets, checkpoints, reached_chunks, chunk_tiles, and the gradients
+// Index space: work-groups of GROUP, one per segment of a tile's list.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, gradient_offsets, checkpoints, reached_segments, segment_tiles, and the gradients
 // of the images. Writes: record_gradients of each splat of each tile.
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 //@@ arguments blend_backward
 ) {
-    local Staged staged[CHUNK];
+    local Staged staged[SEGMENT];
     local float scratch[SCRATCH];
     local float2 *fragments = (local float2 *)scratch;      // [splat][pixel]: transmittance, alpha; then weight, gradient of ln(opacity)
     local PixelGradient shared[PIXELS];
-    local uint offsets[CHUNK], within[PATCHES];               // bits: splats whose bounds overlap a patch
+    local uint offsets[SEGMENT], within[PATCHES];               // bits: splats whose bounds overlap a patch
     const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area, log_ceiling};
     uint id = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H, tiles = tiles_x * tiles_y;
-    if (id >= starts[tiles] / CHUNK + tiles) return;
-    uint tile_index = chunk_tiles[id], start = starts[tile_index], end = starts[tile_index + 1];
-    uint chunk = id - (start / CHUNK + tile_index), first = start + chunk * CHUNK;
+    if (id >= starts[tiles] / SEGMENT + tiles) return;
+    uint tile_index = segment_tiles[id], start = starts[tile_index], end = starts[tile_index + 1];
+    uint segment = id - (start / SEGMENT + tile_index), first = start + segment * SEGMENT;
     if (first >= end) return;
-    uint count = min(end - first, (uint)CHUNK);
+    uint count = min(end - first, (uint)SEGMENT);
     int tile_column = (int)(tile_index % (uint)tiles_x), tile_row = (int)(tile_index / (uint)tiles_x);
     int x0 = tile_column * TILE_W, y0 = tile_row * TILE_H;
 
@@ -219,7 +219,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     }
     if (item < PATCHES) within[item] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (chunk >= reached_chunks[tile_index]) {          // no transmittance left
+    if (segment >= reached_segments[tile_index]) {          // no transmittance left
         for (uint cell = item; cell < count * FIELDS; cell += GROUP)
             record_gradients[(size_t)offsets[cell / FIELDS] * FIELDS + cell % FIELDS] = 0.0f;
         return;

@@ -6,9 +6,9 @@
 // Splats are scattered in memory, so the next ones are prefetched.
 #define PREFETCH_SPLATS 8
 
-// A chunk is as many splats of a tile's list as fit the tape: at least CHUNK, at most TAPE_SPLATS.
-#define TAPE_SPLATS (8 * CHUNK)
-#define TAPE_FRAGMENTS (CHUNK * BLOCKS)
+// A segment is as many splats of a tile's list as fit the tape: at least SEGMENT, at most TAPE_SPLATS.
+#define TAPE_SPLATS (8 * SEGMENT)
+#define TAPE_FRAGMENTS (SEGMENT * BLOCKS)
 #define CHECKPOINT_FLOATS (TILE_W * TILE_H + LANES)        // of a checkpoint: transmittance of each pixel, and the index of the first splat
 
 typedef struct {            // fragments in the order of compositing, block by block
@@ -145,21 +145,21 @@ kernel void blend_backward(
 //@@ pixel_gradient_start
         }
 
-        // forward: transmittance in front of each chunk; the last chunk's fragments stay on the tape
+        // forward: transmittance in front of each segment; the last segment's fragments stay on the tape
         Pixel pixels[BLOCKS];
         for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
         const uint in_image = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
-        uint alive = in_image, position = start, first = start, chunk = 0;
-        global float *own = checkpoints + (size_t)(start / CHUNK + tile_index) * CHECKPOINT_FLOATS;
+        uint alive = in_image, position = start, first = start, segment = 0;
+        global float *own = checkpoints + (size_t)(start / SEGMENT + tile_index) * CHECKPOINT_FLOATS;
         tape->length = 0;
         for (; position < end && alive; position++) {
             if (position == start || tape->length + BLOCKS > TAPE_FRAGMENTS || position - first == TAPE_SPLATS) {
-                chunk += position != start;
+                segment += position != start;
                 first = position;
                 tape->length = 0;
                 for (int block = 0; block < BLOCKS; block++)
-                    VSTORE(pixel_transmittance(&pixels[block]), own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES);
-                ((global uint *)own)[(size_t)chunk * CHECKPOINT_FLOATS + TILE_W * TILE_H] = first;
+                    VSTORE(pixel_transmittance(&pixels[block]), own + (size_t)segment * CHECKPOINT_FLOATS + block * LANES);
+                ((global uint *)own)[(size_t)segment * CHECKPOINT_FLOATS + TILE_W * TILE_H] = first;
             }
             PREFETCH_SPLAT(min(position + PREFETCH_SPLATS, end - 1));
             uint index = lists[position], tape_index = position - first;
@@ -186,12 +186,12 @@ kernel void blend_backward(
         }
         for (bool revisits = false; position > start; revisits = true) {
             if (revisits) {
-                chunk--;
-                first = ((global const uint *)own)[(size_t)chunk * CHECKPOINT_FLOATS + TILE_W * TILE_H];
+                segment--;
+                first = ((global const uint *)own)[(size_t)segment * CHECKPOINT_FLOATS + TILE_W * TILE_H];
                 tape->length = 0;
                 alive = in_image;
                 for (int block = 0; block < BLOCKS; block++) {
-                    pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * CHECKPOINT_FLOATS + block * LANES));
+                    pixel_start(&pixels[block], VLOAD(own + (size_t)segment * CHECKPOINT_FLOATS + block * LANES));
                     if (!VANY(VMASK(pixels[block].t > constants.transmittance_stop))) alive &= ~(1u << block);
                 }
                 for (uint k = first; k < position; k++) {
