@@ -53,7 +53,7 @@ def wall(z: float, grey: float = 0.9, tilt: float = 0.0) -> fs.Scene:
 
 
 def errors(depth: np.ndarray, z: float) -> tuple[float, float, float]:
-    """SplatRange of measured pixels, RMS distance from the fitted plane in metres, and bias in metres."""
+    """Fraction of measured pixels, RMS distance from the fitted plane in metres, and bias in metres."""
     h, w = depth.shape
     y, x = np.mgrid[h // 2 - MIDDLE : h // 2 + MIDDLE, w // 2 - MIDDLE : w // 2 + MIDDLE]
     found = depth[y, x].astype(np.float64)

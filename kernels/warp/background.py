@@ -6,7 +6,7 @@ from functools import cache
 
 import warp as wp
 
-from .common import STRICT, View, first_sample, fma, fma3, fma_dot, store_line, struct_of
+from .common import STRICT, View, first_sample, fma, fma3, fma_dot, store_vec4, struct_of
 from .rays import make_rays
 
 TURN = wp.constant(0.15915494309189535)
@@ -84,6 +84,6 @@ def make_composite_background(kind: str, has_lens: bool):
             added = behind(environment, wp.vec3(fma_dot(r[0], ray), fma_dot(r[1], ray), fma_dot(r[2], ray)))
             for channel in range(3):
                 light[channel] = fma(light[3], added[channel], light[channel])
-            store_line(color, at, light)
+            store_vec4(color, at, light)
 
     return composite_background

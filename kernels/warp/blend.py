@@ -11,7 +11,7 @@ from . import output
 from .bounds import Bounds, make_bounds
 from .buffers import make_samples, sample_fields
 from .cells import CELL_H, CELL_W, make_cells
-from .common import STRICT, View, first_sample, locate_tile, reread, store_line
+from .common import STRICT, View, first_sample, locate_tile, reread, store_vec4
 from .intersection import make_intersection
 from .pixel import make_pixel
 from .rays import RAY_DERIVATIVES
@@ -24,7 +24,7 @@ _CELL = CELL_W * CELL_H
 _NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
-def samples_each(effects: tuple[str, ...]) -> int:
+def samples_per_thread(effects: tuple[str, ...]) -> int:
     """Samples per thread on a GPU: two in a column, for which a record is read once; one with a lens, a
     k-buffer or coplanar layers.
     """
@@ -39,16 +39,16 @@ def make_blend(
     the number of threads of a block on a GPU. area: samples of a tile.
     """
     splats, intersection = make_splat(effects, outputs), make_intersection(effects, outputs)
-    each = samples_each(effects)
-    threads, items, pair = area // each, _CELL // each, each == 2
+    per_thread = samples_per_thread(effects)
+    threads, items, pair = area // per_thread, _CELL // per_thread, per_thread == 2
     staging = make_staging(RecordLayout(effects, outputs), area // _CELL, items)
     overlapping_cells = make_cells(effects, outputs)
     shared_memory, stage, mark_cells, list_cell, cell_splat = (
         *(staging.shared_memory, staging.stage, staging.mark_cells),
         *(staging.list_cell, staging.cell_splat),
     )
-    staged = splats.reading(staging.line)
-    load, box_of, read = staged.load, staged.box_of, splats.read
+    staged_reader = splats.make_readers(staging.staged_vec4)
+    load, box_of, read = staged_reader.load, staged_reader.box_of, splats.read
     column_of, cross, intersect_ray, intersect_derivatives = (
         *(intersection.column, intersection.cross),
         *(intersection.intersect_ray, intersection.intersect_derivatives),
@@ -72,7 +72,7 @@ def make_blend(
 
     @wp.func
     def store(p: Pixel, at: int, samples: Samples):
-        store_line(samples.color, at, wp.vec4(p.r, p.g, p.b, p.t))
+        store_vec4(samples.color, at, wp.vec4(p.r, p.g, p.b, p.t))
         for k in range(wp.static(len(stores))):
             wp.static(stores[k])(p, at, samples)
 
@@ -138,7 +138,7 @@ def make_blend(
         x: float,  # position relative to the anchor
         y: float,
         position: int,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
@@ -147,13 +147,13 @@ def make_blend(
         p = pixel
         if wp.static(branchless):
             c = intersect(s, column, ray, ray_derivatives, x, y, view)
-            p = blend_one(p, s, c, position, lines, lists, coplanar_groups, view)
+            p = blend_one(p, s, c, position, records, lists, coplanar_groups, view)
         elif unfinished(p, view):
             c = intersect(s, column, ray, ray_derivatives, x, y, view)
             if wp.static(has_fragment_functions):
                 p = call_fragment_functions(p, s, c, x, y, view)
             if c.contributes:
-                p = blend_one(p, s, c, position, lines, lists, coplanar_groups, view)
+                p = blend_one(p, s, c, position, records, lists, coplanar_groups, view)
         return p
 
     # 768 threads at once: at most 80 registers, enough for two samples without other outputs
@@ -166,7 +166,7 @@ def make_blend(
         tile_order: wp.array(dtype=wp.int32),  # tile of block 0 at band_first
         views: wp.array(dtype=View),
         rays: Rays,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         coplanar_groups: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
@@ -178,14 +178,14 @@ def make_blend(
         number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]
         left, top = tile_column * view.tile_w, tile_row * view.tile_h
-        # a warp renders `each` rows of four cells
+        # a warp renders `per_thread` rows of four cells
         warp, lane = item / 32, item % 32
         across, own = view.tile_w / (4 * CELL_W), lane % items
         cell_x = warp % across * 4 + lane / items % 4
-        cell_y = warp / across * each + lane / items / 4
+        cell_y = warp / across * per_thread + lane / items / 4
         cell = cell_y * (4 * across) + cell_x
         x0 = left + cell_x * CELL_W + own % CELL_W
-        y0 = top + cell_y * CELL_H + own / CELL_W * each
+        y0 = top + cell_y * CELL_H + own / CELL_W * per_thread
         p = new_sample(x0, y0, number, rays, view)
         end = starts[tile + 1]
         if wp.static(has_layers):
@@ -201,13 +201,13 @@ def make_blend(
         if wp.static(has_ray_derivatives):
             if p.t > 0.0:
                 ray_derivatives = rays.ray_derivatives[y0 * view.width + x0]
-        records = shared_memory()
+        shared = shared_memory()
         again = bool(True)
         while again:
             k = starts[tile]
             while k < end:
                 length = wp.min(end - k, STAGED)
-                if not stage(records, lines, lists, k, length, alive):
+                if not stage(shared, records, lists, k, length, alive):
                     break
                 view = views[reread(number)]
                 word = warp
@@ -216,21 +216,21 @@ def make_blend(
                     for group in range(wp.static(-(-area // (32 * _CELL)))):
                         cells = _NONE
                         if which < length:
-                            s = load(records, lines, lists, k, which, view)
+                            s = load(shared, records, lists, k, which, view)
                             cells = overlapping_cells(
-                                s, box_of(records, lines, lists, k, which), left, top, group, view
+                                s, box_of(shared, records, lists, k, which), left, top, group, view
                             )
-                        mark_cells(records, word, group, cells)
+                        mark_cells(shared, word, group, cells)
                     word += wp.static(threads // 32)
                 view = views[reread(number)]
-                count = list_cell(records, length, cell)
+                count = list_cell(shared, length, cell)
                 if not alive:
                     count = 0
                 for n in range(count):
-                    which = cell_splat(records, cell, n)
-                    s = load(records, lines, lists, k, which, view)
+                    which = cell_splat(shared, cell, n)
+                    s = load(shared, records, lists, k, which, view)
                     if alone():
-                        box = box_of(records, lines, lists, k, which)
+                        box = box_of(shared, records, lists, k, which)
                         cells = overlapping_cells(s, box, left, top, cell / 32, view)
                         if (cells >> wp.uint32(cell % 32) & _ONE) == _NONE:
                             continue
@@ -238,7 +238,7 @@ def make_blend(
                     column = wp.vec3(column_of(s.u, x), column_of(s.v, x), column_of(s.d, x))
                     at = k + which
                     p = blend_splat(
-                        p, s, column, ray, ray_derivatives, x, y, at, lines, lists, coplanar_groups, view
+                        p, s, column, ray, ray_derivatives, x, y, at, records, lists, coplanar_groups, view
                     )
                     if wp.static(pair):
                         q = blend_splat(
@@ -250,7 +250,7 @@ def make_blend(
                             x,
                             y + 1.0,
                             at,
-                            lines,
+                            records,
                             lists,
                             coplanar_groups,
                             view,
@@ -261,9 +261,9 @@ def make_blend(
                 k += length
             again = False
             if wp.static(repeats):
-                p = end_pass(p, lines, lists, view)
+                p = end_pass(p, records, lists, view)
                 alive = unfinished(p, view)
-                again = stage(records, lines, lists, end, 0, alive)
+                again = stage(shared, records, lists, end, 0, alive)
         number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
@@ -280,7 +280,7 @@ def make_blend(
         band_first: int,  # tile of thread 0
         views: wp.array(dtype=View),
         rays: Rays,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         coplanar_groups: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
@@ -311,7 +311,7 @@ def make_blend(
             k = starts[tile]
             while k < end and alive > 0:
                 index = lists[k]
-                s = read(lines, lists, k, view)
+                s = read(records, lists, k, view)
                 k += 1
                 b = bounds[index]
                 top, bottom = limits.rows(b, view.height)
@@ -338,7 +338,7 @@ def make_blend(
                             at = state_first + (row - y0) * view.tile_w + column - x0
                             p = state[at]
                             if unfinished(p, view):
-                                p = blend_one(p, s, c, k - 1, lines, lists, coplanar_groups, view)
+                                p = blend_one(p, s, c, k - 1, records, lists, coplanar_groups, view)
                                 if not unfinished(p, view):
                                     alive -= 1
                                 state[at] = p
@@ -346,7 +346,7 @@ def make_blend(
             if wp.static(repeats):
                 alive = int(0)
                 for at in range(state_first, state_first + view.tile_w * view.tile_h):
-                    p = end_pass(state[at], lines, lists, view)
+                    p = end_pass(state[at], records, lists, view)
                     if unfinished(p, view):
                         alive += 1
                     state[at] = p

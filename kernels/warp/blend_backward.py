@@ -204,7 +204,7 @@ def make_blend_backward(
         views: wp.array(dtype=View),  # (1)
         background: wp.vec3,
         log_ceiling: float,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
         gradient_offsets: wp.array(dtype=wp.int32),
@@ -236,9 +236,9 @@ def make_blend_backward(
             first = start + segments * SEGMENT
             checkpoints[own + segments * threads] = transmittance
             for position in range(wp.min(SEGMENT, end - first)):
-                box = box_of(lines, lists[first + position])
+                box = box_of(records, lists[first + position])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
-                    s = read(lines, lists, first + position, view)
+                    s = read(records, lists, first + position, view)
                     transmittance = transmittance_behind(
                         transmittance, alpha_at(s, x, y, transmittance, view)
                     )
@@ -253,9 +253,9 @@ def make_blend_backward(
             transmittances, alphas = segment_of(), segment_of()
             for position in range(count):
                 transmittances[position] = transmittance
-                box = box_of(lines, lists[first + position])
+                box = box_of(records, lists[first + position])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
-                    s = read(lines, lists, first + position, view)
+                    s = read(records, lists, first + position, view)
                     alpha = alpha_at(s, x, y, transmittance, view)
                     transmittance = transmittance_behind(transmittance, alpha)
                     alphas[position] = alpha
@@ -265,11 +265,11 @@ def make_blend_backward(
                 contributes = alphas[position] > 0.0
                 values = GradientSums()
                 if any_of_warp(contributes):
-                    s = read(lines, lists, first + position, view)
+                    s = read(records, lists, first + position, view)
                     if contributes:
                         values, pixel_gradient = fragment_gradient(
                             s, lists[first + position], x, y, transmittances[position], alphas[position],
-                            pixel_gradient, log_ceiling, lines, view,
+                            pixel_gradient, log_ceiling, records, view,
                         )  # fmt: skip
                 sum_over_warp(
                     parts, position, contributes, values, gradient_sums, gradient_offsets[first + position]
@@ -277,10 +277,10 @@ def make_blend_backward(
             sum_over_block(parts, first, count, gradient_sums, gradient_offsets)
 
     @wp.func
-    def clipped_box(lines: wp.array(dtype=wp.vec4), index: int, x0: int, y0: int, view: View) -> wp.vec4i:
+    def clipped_box(records: wp.array(dtype=wp.vec4), index: int, x0: int, y0: int, view: View) -> wp.vec4i:
         """Box of the tile's samples that the splat may overlap, relative to the tile's first sample (x0,
         y0)."""
-        box = box_of(lines, index)
+        box = box_of(records, index)
         return wp.vec4i(
             wp.max(box[0] - x0, 0),
             wp.min(box[1] - x0, view.tile_w),
@@ -296,7 +296,7 @@ def make_blend_backward(
         x0: int,
         y0: int,
         state_first: int,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         transmittances: wp.array(dtype=wp.float32),
         fragments: wp.array(dtype=wp.vec2),
@@ -304,8 +304,8 @@ def make_blend_backward(
     ) -> int:
         """Attenuate the samples of a tile by the splat lists[k], and store its fragments; returns the number
         of samples that are not terminated."""
-        s = read(lines, lists, k, view)
-        area = clipped_box(lines, lists[k], x0, y0, view)
+        s = read(records, lists, k, view)
+        area = clipped_box(records, lists[k], x0, y0, view)
         left = alive
         for row in range(area[2], area[3]):
             for column in range(area[0], area[1]):
@@ -325,7 +325,7 @@ def make_blend_backward(
         views: wp.array(dtype=View),  # (1)
         background: wp.vec3,
         log_ceiling: float,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
         gradient_offsets: wp.array(dtype=wp.int32),
@@ -364,7 +364,17 @@ def make_blend_backward(
                 for k in range(area):
                     checkpoints[own + segment * area + k] = transmittances[state_first + k]
             alive = attenuate(
-                processed, position, alive, x0, y0, state_first, lines, lists, transmittances, fragments, view
+                processed,
+                position,
+                alive,
+                x0,
+                y0,
+                state_first,
+                records,
+                lists,
+                transmittances,
+                fragments,
+                view,
             )
             processed += 1
 
@@ -383,7 +393,7 @@ def make_blend_backward(
                         x0,
                         y0,
                         state_first,
-                        lines,
+                        records,
                         lists,
                         transmittances,
                         fragments,
@@ -391,8 +401,8 @@ def make_blend_backward(
                     )
             while processed > first:
                 processed -= 1
-                s = read(lines, lists, processed, view)
-                touched = clipped_box(lines, lists[processed], x0, y0, view)
+                s = read(records, lists, processed, view)
+                touched = clipped_box(records, lists[processed], x0, y0, view)
                 total = GradientSums()
                 for row in range(touched[2], touched[3]):
                     for column in range(touched[0], touched[1]):
@@ -401,7 +411,7 @@ def make_blend_backward(
                         if fragment[1] > 0.0:
                             values, pixel_gradient = fragment_gradient(
                                 s, lists[processed], x0 + column, y0 + row, fragment[0], fragment[1],
-                                pixel_gradients[at], log_ceiling, lines, view,
+                                pixel_gradients[at], log_ceiling, records, view,
                             )  # fmt: skip
                             pixel_gradients[at] = pixel_gradient
                             total += values

@@ -168,27 +168,27 @@ def fma_dot(a: wp.vec3, b: wp.vec3) -> float:
 # loads.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    const float4 quad = __ldg(reinterpret_cast<const float4*>(lines.data) + at);
+    const float4 quad = __ldg(reinterpret_cast<const float4*>(records.data) + at);
     return wp::vec_t<4, wp::float32>(quad.x, quad.y, quad.z, quad.w);
 #else
-    return lines.data[at];
+    return records.data[at];
 #endif
 """)
-def line_of(lines: wp.array(dtype=wp.vec4), at: int) -> wp.vec4:
-    """lines[at]; read-only during the launch."""
+def load_vec4(records: wp.array(dtype=wp.vec4), at: int) -> wp.vec4:
+    """records[at]; read-only during the launch."""
     ...
 
 
 # One 16-byte store on CUDA: each of four stores would write to all 32 records of a warp.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    reinterpret_cast<float4*>(lines.data)[at] = make_float4(value[0], value[1], value[2], value[3]);
+    reinterpret_cast<float4*>(records.data)[at] = make_float4(value[0], value[1], value[2], value[3]);
 #else
-    lines.data[at] = value;
+    records.data[at] = value;
 #endif
 """)
-def store_line(lines: wp.array(dtype=wp.vec4), at: int, value: wp.vec4):
-    """lines[at] = value."""
+def store_vec4(records: wp.array(dtype=wp.vec4), at: int, value: wp.vec4):
+    """records[at] = value."""
     ...
 
 

@@ -24,7 +24,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     """Make the function that fills a record for these effects and outputs."""
     layout = RecordLayout(effects, outputs)
     vec3 = wp.types.vector(3, real)
-    words = wp.types.vector(4 * layout.lines, wp.float32)
+    words = wp.types.vector(4 * layout.vec4s, wp.float32)
     sqrt_half, edge_on = real(math.sqrt(0.5)), real(1e-13 if real is wp.float64 else 1e-6)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     has_depth, has_lowpass_disc, parallel, exact = (

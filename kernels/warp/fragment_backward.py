@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .buffers import make_samples, sample_fields
-from .common import View, fma, line_of, of_bits, struct_of
+from .common import View, fma, load_vec4, of_bits, struct_of
 from .ellipsoids import EXACT
 from .intersection import HALF_RHO_OF_RANGE, make_intersection
 from .output.distortion import INVERSE_DEPTH, SPREAD_NEAR
@@ -56,13 +56,13 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
     at = {name: position for position, name in enumerate(names)}
     GradientSums = wp.types.vector(len(names), wp.float32)
     layout = RecordLayout(effects, outputs)
-    each = layout.lines
-    z_line, z_lane = layout.position("z_numerator")
-    zc_line, zc_lane = layout.position("z_center")
-    zr_line, zr_lane = layout.position("z_reach")
+    stride = layout.vec4s
+    z_vec4, z_component = layout.position("z_numerator")
+    zc_vec4, zc_component = layout.position("z_center")
+    zr_vec4, zr_component = layout.position("z_reach")
     normals = [layout.position(name) for name in ("nx", "ny", "nz")]
-    box_line, box_lane = layout.position("columns")
-    rows_line, rows_lane = layout.position("rows")
+    box_vec4, box_component = layout.position("columns")
+    rows_vec4, rows_component = layout.position("rows")
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     arrays = {name: wp.array(dtype=wp.float32) for name in gradient_outputs}
     ImageGradients = struct_of(
@@ -79,10 +79,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
     )
 
     @wp.func
-    def box_of(lines: wp.array(dtype=wp.vec4), index: int) -> wp.vec4i:
+    def box_of(records: wp.array(dtype=wp.vec4), index: int) -> wp.vec4i:
         """Box of samples that the splat may overlap: columns [first, end), then rows [first, end)."""
-        left, end = of_bits(line_of(lines, index * each + box_line)[box_lane])
-        top, bottom = of_bits(line_of(lines, index * each + rows_line)[rows_lane])
+        left, end = of_bits(load_vec4(records, index * stride + box_vec4)[box_component])
+        top, bottom = of_bits(load_vec4(records, index * stride + rows_vec4)[rows_component])
         return wp.vec4i(left, end, top, bottom)
 
     @wp.func
@@ -144,7 +144,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
 
     @wp.func
     def depth_at(
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         index: int,
         s: Splat,
         c: Intersection,
@@ -162,10 +162,10 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
         Returns z; the derivatives with respect to z_numerator, z_center, and D at constant
         z_numerator - z_center D; with respect to q and lowpass_half_rho; and with respect to ellipsoid_term.
         """
-        position = index * each
-        center = line_of(lines, position + zc_line)[zc_lane]
-        reach = line_of(lines, position + zr_line)[zr_lane]
-        numerator = line_of(lines, position + z_line)[z_lane]
+        position = index * stride
+        center = load_vec4(records, position + zc_vec4)[zc_component]
+        reach = load_vec4(records, position + zr_vec4)[zr_component]
+        numerator = load_vec4(records, position + z_vec4)[z_component]
         z, grad_record, grad_dot = center, wp.vec3(0.0, 1.0, 0.0), wp.vec2()
         ahead = c.d > 0.0 and c.d <= s.v[3]
         circle = wp.max(lowpass_half_rho, HALF_RHO_OF_RANGE)
@@ -206,7 +206,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
         alpha: float,
         before: PixelGradient,
         log_ceiling: float,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         view: View,
     ):
         """Contribution of a fragment to the derivatives with respect to its record, and the state of the
@@ -236,16 +236,16 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], gradient_
             if wp.static(has_lowpass_disc):
                 lowpass_half_rho = c.lowpass_half_rho
             z, grad_record, grad_dot_depth, grad_ellipsoid_term = depth_at(
-                lines, index, s, c, inverse_d, lowpass_half_rho
+                records, index, s, c, inverse_d, lowpass_half_rho
             )
         if wp.static(depth):
             grad_weight += fma(pixel_gradient.depth, z, pixel_gradient.depth_weight)
             grad_z += weight * pixel_gradient.depth
         if wp.static(normal):
             facing = wp.vec3(
-                line_of(lines, index * each + wp.static(normals[0][0]))[wp.static(normals[0][1])],
-                line_of(lines, index * each + wp.static(normals[1][0]))[wp.static(normals[1][1])],
-                line_of(lines, index * each + wp.static(normals[2][0]))[wp.static(normals[2][1])],
+                load_vec4(records, index * stride + wp.static(normals[0][0]))[wp.static(normals[0][1])],
+                load_vec4(records, index * stride + wp.static(normals[1][0]))[wp.static(normals[1][1])],
+                load_vec4(records, index * stride + wp.static(normals[2][0]))[wp.static(normals[2][1])],
             )
             grad_weight += wp.dot(pixel_gradient.normal, facing)
         if wp.static(distortion):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .boxes import between, between_curves
-from .common import View, fma, line_of, struct_of
+from .common import View, fma, load_vec4, struct_of
 from .ellipsoids import EXACT, FACING
 from .fast import fast_exp
 from .rays import RAY_DERIVATIVES
@@ -25,7 +25,7 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     """
     Splat = make_splat(effects, outputs).Splat
     layout = RecordLayout(effects, outputs)
-    each = layout.lines
+    stride = layout.vec4s
     has_lowpass_disc, has_lens, parallel, all_boxes = (
         name in effects for name in ("lowpass_screen", "rays", "camera_orthographic", "footprint_box")
     )
@@ -44,9 +44,9 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
     # cover: coverage of the sample by a box
     fields |= {"cover": wp.float32} if boxes else {}
     Intersection = struct_of("Intersection", "Where the ray of a sample meets a splat.", fields)
-    z_line, z_lane = layout.position("z_numerator")
-    zc_line, zc_lane = layout.position("z_center")
-    zr_line, zr_lane = layout.position("z_reach")
+    z_vec4, z_component = layout.position("z_numerator")
+    zc_vec4, zc_component = layout.position("z_center")
+    zr_vec4, zr_component = layout.position("z_reach")
 
     @wp.func
     def column(form: wp.vec4, x: float) -> float:
@@ -163,18 +163,23 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
 
     @wp.func
     def depth_of(
-        lines: wp.array(dtype=wp.vec4), index: int, s: Splat, c: Intersection, inverse_d: float, printed: bool
+        records: wp.array(dtype=wp.vec4),
+        index: int,
+        s: Splat,
+        c: Intersection,
+        inverse_d: float,
+        coplanar: bool,
     ) -> float:
         """Depth of the ray-plane intersection, clamped to the splat's depth range; the centre's depth if the
         ray does not intersect the plane beyond `near`.
 
         Outside of the circle rho = max(2 ln 255, rho of the low-pass disc) the intersection is reflected at
-        the circle: the difference from the centre's depth is multiplied by the ratio of their rho. printed:
+        the circle: the difference from the centre's depth is multiplied by the ratio of their rho. coplanar:
         whether the splat is in a coplanar group, whose depths are not reflected.
         """
-        at = index * each
-        center = line_of(lines, at + zc_line)[zc_lane]
-        reach = line_of(lines, at + zr_line)[zr_lane]
+        at = index * stride
+        center = load_vec4(records, at + zc_vec4)[zc_component]
+        reach = load_vec4(records, at + zr_vec4)[zr_component]
         if not (c.d > 0.0):
             return center
         depth_d, beyond_near = float(0.0), bool(False)  # depth times D
@@ -182,14 +187,14 @@ def make_intersection(effects: tuple[str, ...], outputs: tuple[str, ...]) -> Sim
             depth_d = c.z
             beyond_near = c.z >= s.plane[3] * c.d
         else:
-            depth_d = line_of(lines, at + z_line)[z_lane]
+            depth_d = load_vec4(records, at + z_vec4)[z_component]
             beyond_near = c.d <= s.v[3]
         depth = depth_d * inverse_d
         if wp.static(has_lowpass_disc):
             if not beyond_near:
                 return center
             circle = wp.max(c.lowpass_half_rho, HALF_RHO_OF_RANGE)
-            if not (printed or c.q * inverse_d * inverse_d <= circle):
+            if not (coplanar or c.q * inverse_d * inverse_d <= circle):
                 depth = fma(circle * (depth_d - center * c.d), c.d / c.q, center)
         return wp.clamp(depth, center - reach, center + reach)
 

@@ -36,7 +36,7 @@ def make_k_buffer_struct(size: int):
 def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace:
     """Make functions of a Pixel with a `k_buffer`: start; insert, for a fragment; end, after the list.
 
-    attributes_of(lines, index, z): attributes of a splat's fragment at depth z.
+    attributes_of(records, index, z): attributes of a splat's fragment at depth z.
     """
     last = size - 1
 
@@ -56,14 +56,14 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         z: float,
         alpha: float,
         position: int,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
         """Composite a buffered fragment."""
         p = pixel
         if position != _EMPTY:
-            p = composite(p, attributes_of(lines, lists[position], z), alpha, view)
+            p = composite(p, attributes_of(records, lists[position], z), alpha, view)
         return p
 
     @wp.func
@@ -100,7 +100,7 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         z: float,
         alpha: float,
         position: int,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
@@ -115,7 +115,7 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         first_z, first_alpha = float(p.k_buffer.z[0]), float(p.k_buffer.alpha[0])
         first_position = int(p.k_buffer.position[0])
         if z < first_z:
-            return composite_at(p, z, alpha, position, lines, lists, view)
+            return composite_at(p, z, alpha, position, records, lists, view)
         for k in range(wp.static(last)):
             if p.k_buffer.z[k + 1] <= z:
                 p.k_buffer.z[k] = p.k_buffer.z[k + 1]
@@ -129,7 +129,7 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
             p.k_buffer.z[last] = z
             p.k_buffer.alpha[last] = alpha
             p.k_buffer.position[last] = position
-        return composite_at(p, first_z, first_alpha, first_position, lines, lists, view)
+        return composite_at(p, first_z, first_alpha, first_position, records, lists, view)
 
     @wp.func
     def insert(
@@ -138,20 +138,20 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         z: float,
         alpha: float,
         position: int,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
         """Insert a fragment of the splat at `position` in the list, whose fragments are beyond `nearest`."""
         if in_this_pass(pixel, z, position):
-            return insert_sorted(pixel, nearest, z, alpha, position, lines, lists, view)
+            return insert_sorted(pixel, nearest, z, alpha, position, records, lists, view)
         return pixel
 
     @wp.func
     def composite_until(
         pixel: Pixel,
         nearest: float,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
@@ -160,7 +160,7 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
         for k in range(wp.static(size)):
             position = int(p.k_buffer.position[k])
             if p.k_buffer.z[k] <= nearest and position != _EMPTY:
-                p = composite_at(p, p.k_buffer.z[k], p.k_buffer.alpha[k], position, lines, lists, view)
+                p = composite_at(p, p.k_buffer.z[k], p.k_buffer.alpha[k], position, records, lists, view)
                 p.k_buffer.z[k] = -wp.inf
                 p.k_buffer.position[k] = _EMPTY
         return p
@@ -168,12 +168,12 @@ def make_k_buffer(Pixel, composite, attributes_of, size: int) -> SimpleNamespace
     @wp.func
     def end(
         pixel: Pixel,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         view: View,
     ):
         """Composite all entries after the last splat of the list, and start the next pass."""
-        p = composite_until(pixel, float(wp.inf), lines, lists, view)
+        p = composite_until(pixel, float(wp.inf), records, lists, view)
         p.k_buffer.after_z = p.k_buffer.until_z
         p.k_buffer.after = p.k_buffer.until
         p.k_buffer.until_z = wp.inf

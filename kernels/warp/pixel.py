@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import output
-from .common import MIN_ALPHA, View, fma, line_of, reciprocal, struct_of
+from .common import MIN_ALPHA, View, fma, load_vec4, reciprocal, struct_of
 from .coplanar import make_layer
 from .intersection import make_intersection
 from .k_buffer import make_k_buffer, make_k_buffer_struct
@@ -30,7 +30,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
     Intersection, is_box = intersection.Intersection, intersection.is_box
     alpha_of, depth_of = intersection.alpha_of, intersection.depth_of
     layout = RecordLayout(effects, outputs)
-    each = layout.lines
+    stride = layout.vec4s
     exclusive, has_depth, k_buffered, layered, has_lens = (
         name in effects for name in ("stop_exclusive", "ray_depth", "order_pixel", "order_coplanar", "rays")
     )
@@ -110,7 +110,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             return p.t > view.transmittance_stop
 
     @wp.func
-    def attributes_at(color: wp.vec3, z: float, lines: wp.array(dtype=wp.vec4), index: int):
+    def attributes_at(color: wp.vec3, z: float, records: wp.array(dtype=wp.vec4), index: int):
         """Attributes of a splat's fragment at depth z."""
         attributes = Attributes()
         attributes.rgb = color
@@ -118,7 +118,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             attributes.z = z
         for k in range(wp.static(len(attribute_readers))):
             attributes = wp.static(attribute_readers[k])(
-                attributes, wp.static(readers[k])(lines, index * each), index
+                attributes, wp.static(readers[k])(records, index * stride), index
             )
         return attributes
 
@@ -146,15 +146,15 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         return p
 
     @wp.func
-    def stored_attributes(lines: wp.array(dtype=wp.vec4), index: int, z: float):
+    def stored_attributes(records: wp.array(dtype=wp.vec4), index: int, z: float):
         """Attributes of a fragment with the stored colour of its splat."""
-        c = line_of(lines, index * each + wp.static(layout.position("r")[0]))
-        return attributes_at(wp.vec3(c[1], c[2], c[3]), z, lines, index)
+        c = load_vec4(records, index * stride + wp.static(layout.position("r")[0]))
+        return attributes_at(wp.vec3(c[1], c[2], c[3]), z, records, index)
 
     @wp.func
-    def nearest_of(lines: wp.array(dtype=wp.vec4), index: int) -> float:
+    def nearest_of(records: wp.array(dtype=wp.vec4), index: int) -> float:
         """Lower bound of the depths of a splat's fragments."""
-        return line_of(lines, index * each + wp.static(layout.position("nearest")[0]))[
+        return load_vec4(records, index * stride + wp.static(layout.position("nearest")[0]))[
             wp.static(layout.position("nearest")[1])
         ]
 
@@ -167,7 +167,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
         s: Splat,
         c: Intersection,
         position: int,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         coplanar_groups: wp.array(dtype=wp.int32),
         view: View,
@@ -187,7 +187,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
             if pixel.layers.exist != 0:
                 group = coplanar_groups[index % view.splats]
         if wp.static(has_depth):
-            z = depth_of(lines, index, s, c, inverse_d, group >= 0)
+            z = depth_of(records, index, s, c, inverse_d, group >= 0)
         if wp.static(has_external_depth):
             if not (z < pixel.opaque_z):
                 return pixel
@@ -199,7 +199,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
                     return p  # without optical depth the mean of a layer would be 0 / 0
                 p.layers = select(p.layers, group)
                 if group >= 0:
-                    attributes = attributes_at(color, z, lines, index)
+                    attributes = attributes_at(color, z, records, index)
                     if wp.static(boxes):
                         if is_box(s):
                             p.layers.current = layer.accumulate_box(p.layers.current, attributes, alpha)
@@ -209,17 +209,17 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
                 if not admits(p.layers, z):
                     return p
         if wp.static(k_buffered):
-            return k_buffer.insert(p, nearest_of(lines, index), z, alpha, position, lines, lists, view)
+            return k_buffer.insert(p, nearest_of(records, index), z, alpha, position, records, lists, view)
         else:
-            return composite(p, attributes_at(color, z, lines, index), alpha, view)
+            return composite(p, attributes_at(color, z, records, index), alpha, view)
 
     @wp.func
-    def end(pixel: Pixel, lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32), view: View):
+    def end(pixel: Pixel, records: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32), view: View):
         """Composite the rest of this pass after the last splat of the list, and start the next pass."""
         p = pixel
         dropped = bool(False)
         if wp.static(k_buffered):
-            p = end_k_buffer(p, lines, lists, view)
+            p = end_k_buffer(p, records, lists, view)
             dropped = p.k_buffer.after_z < wp.inf
         if wp.static(layered):
             p.layers = close_layers(p.layers)
@@ -273,19 +273,19 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], k_buffer_size
 
 
 def make_reader(layout: RecordLayout, names: tuple[str, ...]):
-    """Make the function (lines, at) that reads these numbers of the record at line `at` as a vector."""
+    """Make the function (records, at) that reads these numbers of the record at line `at` as a vector."""
     places = [layout.position(name) for name in names]
     vector = wp.types.vector(max(len(names), 1), wp.float32)
 
     @wp.func
-    def nothing(lines: wp.array(dtype=wp.vec4), at: int) -> float:
+    def nothing(records: wp.array(dtype=wp.vec4), at: int) -> float:
         return 0.0
 
     @wp.func
-    def read(lines: wp.array(dtype=wp.vec4), at: int):
+    def read(records: wp.array(dtype=wp.vec4), at: int):
         numbers = vector()
         for k in range(wp.static(len(places))):
-            numbers[k] = line_of(lines, at + wp.static(places[k][0]))[wp.static(places[k][1])]
+            numbers[k] = load_vec4(records, at + wp.static(places[k][0]))[wp.static(places[k][1])]
         return numbers
 
     return read if names else nothing

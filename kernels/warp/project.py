@@ -9,7 +9,7 @@ from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
-from .common import CULLED, STRICT, View, as_bits, divide, reread, sortable, store_line
+from .common import CULLED, STRICT, View, as_bits, divide, reread, sortable, store_vec4
 from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .fast import make_log
@@ -47,7 +47,7 @@ def make_project(
         bounds of all visible splats; otherwise only of splats whose tiles exceed the bit mask `windows`.
     """
     layout = RecordLayout(effects, outputs)
-    lines_each = layout.lines
+    stride = layout.vec4s
     has_depth, has_lowpass_disc, filtered, k_buffered, layers = (
         name in effects
         for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "order_pixel", "order_coplanar")
@@ -110,7 +110,7 @@ def make_project(
         coplanar_groups: wp.array(dtype=wp.int32),  # (n) index of the splat's coplanar group; -1: none
         boxes: wp.array(dtype=wp.int32),  # (n) 1: a box; for clouds with boxes and other splats
         thickness: wp.array(dtype=wp.float32),  # (n) [m], for clouds with 3D Gaussians; 0: a disk
-        lines: wp.array(dtype=wp.vec4),  # (views n lines_each) out: records of visible splats
+        records: wp.array(dtype=wp.vec4),  # (views n stride) out: records of visible splats
         bounds: wp.array(dtype=Bounds),  # (views n) out: see `every_bounds`
         windows: wp.array(
             dtype=wp.uint64
@@ -313,10 +313,10 @@ def make_project(
                 unit_normal = outward
         for k in range(wp.static(len(projects))):
             record = wp.static(projects[k])(record, wp.static(words[k]), unit_normal, offset)
-        for line in range(wp.static(lines_each)):
-            k = 4 * line
-            store_line(
-                lines, at * lines_each + line, wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
+        for n in range(wp.static(stride)):
+            k = 4 * n
+            store_vec4(
+                records, at * stride + n, wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
             )
         if wp.static(every_bounds) or bits == NONE:
             bounds[at] = box

@@ -13,7 +13,7 @@ from functools import cache
 import warp as wp
 
 from .color import basis_value
-from .common import CULLED, STRICT, View, line_of
+from .common import CULLED, STRICT, View, load_vec4
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .ellipsoids_backward import make_ellipsoids_backward
 from .project import SMALLEST_SCALE
@@ -73,14 +73,14 @@ def make_project_backward(
     """Make the kernel of the backward pass of the projection. effects, outputs: of the record. names: names
     of the sums. sh_coefficients: SH coefficients per colour, 0 for plain colours."""
     layout = RecordLayout(effects, outputs)
-    each, fields = layout.lines, len(names)
+    stride, fields = layout.vec4s, len(names)
     at = {name: position for position, name in enumerate(names)}
     GradientSums, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
     screen_filter, has_depth, normal = (name in at for name in ("lowpass_x", "z_center", "nx"))
     exact, ewa = EXACT in effects, any(name in effects for name in EWA)
     has_gaussians = exact or ewa
     ellipsoid, solid_backward = make_ellipsoids(effects, wp.float64), make_ellipsoids_backward(effects)
-    zc_line, zc_lane = layout.position("z_center")
+    zc_vec4, zc_component = layout.position("z_center")
     terms = max(sh_coefficients, 1)
     lowpass_x, z_numerator, nx, ellipsoid_term = (
         at.get(name, 0) for name in ("lowpass_x", "z_numerator", "nx", "ellipsoid_term")
@@ -96,7 +96,7 @@ def make_project_backward(
         thickness: wp.array(dtype=wp.float32),  # for clouds with 3D Gaussians; 0: a disk
         opacities: wp.array(dtype=wp.float32),
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_coefficients)
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         keys: wp.array(dtype=wp.uint32),
         counts: wp.array(dtype=wp.int32),
         ends_by_index: wp.array(dtype=wp.int32),
@@ -139,7 +139,9 @@ def make_project_backward(
         if wp.static(sh_coefficients == 0):
             grad_colors[i] = grad_rgb
         else:
-            clamped = line_of(lines, i * each + 3)  # ay, r, g, b; colours clamped at 0 have no derivative
+            clamped = load_vec4(
+                records, i * stride + 3
+            )  # ay, r, g, b; colours clamped at 0 have no derivative
             for channel in range(3):
                 if not (clamped[channel + 1] > 0.0):
                     grad_rgb[channel] = 0.0
@@ -176,10 +178,10 @@ def make_project_backward(
                 b = of_disk[1]
 
         # the record's forms, and their common factor
-        anchor = line_of(lines, i * each + 2)[3]
+        anchor = load_vec4(records, i * stride + 2)[3]
         ray = wp.vec3d(
             (wp.float64(anchor) + _HALF - view.center_x) * view.per_focal_x,
-            (wp.float64(line_of(lines, i * each + 3)[0]) + _HALF - view.center_y) * view.per_focal_y,
+            (wp.float64(load_vec4(records, i * stride + 3)[0]) + _HALF - view.center_y) * view.per_focal_y,
             _ONE,
         )
         form_u, form_v, form_d = wp.cross(b, p), wp.cross(p, a), wp.cross(a, b)
@@ -200,7 +202,7 @@ def make_project_backward(
             # by z_numerator - z_center D, z_numerator = (a x b) p: small differences of large numbers
             volume = scale * total[z_numerator]
             along = wp.vec3d(total[z_numerator + 1] * per_x, total[z_numerator + 2] * per_y, _ZERO)
-            center = wp.float64(line_of(lines, i * each + zc_line)[zc_lane])
+            center = wp.float64(load_vec4(records, i * stride + zc_vec4)[zc_component])
             g_d += volume * (p - center * ray) - scale * center * along
         grad_a = wp.cross(g_v, p) + wp.cross(b, g_d)
         grad_b = wp.cross(p, g_u) + wp.cross(g_d, a)

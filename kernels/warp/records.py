@@ -14,7 +14,7 @@ _FORMS = (
 _EDGES = ("edge_u0", "edge_u1", "edge_v0", "edge_v1")
 BOXES = ("footprint_box", "footprint_mixed")
 """effects with boxes"""
-_WHOLE = {
+_ALIGNED = {
     "camera_orthographic": ("plane_z0", "plane_zx", "plane_zy", "plane_near"),
     "rays": ("nuz", "nvz", "dz", "ray_x", "ray_y", "ray_z"),
 }
@@ -27,31 +27,32 @@ _EXTRA = {
 
 
 class RecordLayout:
-    """Memory layout of a record: number of lines of four floats (16 bytes), and position of each number.
+    """Memory layout of a record: number of vec4s (four floats, 16 bytes), and position of each number.
 
     nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples relative to the centre of the anchor
-    sample (ax, ay); D is at most d_near beyond the near plane. lowpass_x, lowpass_y: projected centre
-    relative to the anchor; z_numerator / D is the depth. columns and rows: [first, end) of the box of samples
-    that the splat may overlap, 16 bits each. Behind a lens x, y, z are a sample's ray minus the anchor's ray
-    (ray_x, ray_y, ray_z), and boxed is 1 for a box, else 0. For parallel rays plane_z0 + plane_zx x +
-    plane_zy y is D times the depth, with a minimum of plane_near. ellipsoid_term: 2 / m^2 of a 3D Gaussian
-    (ellipsoids.py), else 0. Fields of outputs follow.
+    sample (ax, ay). Where the splat is beyond the near plane, D is at most d_near. lowpass_x, lowpass_y:
+    projected centre relative to the anchor. z_numerator / D is the depth. columns and rows: [first, end) of
+    the box of samples that the splat may overlap, 16 bits each. Behind a lens x, y, z are a sample's ray
+    minus the anchor's ray (ray_x, ray_y, ray_z), and boxed is 1 for a box, else 0. For parallel rays
+    plane_z0 + plane_zx x + plane_zy y is D times the depth, with a minimum of plane_near. ellipsoid_term:
+    2 / m^2 of a 3D Gaussian (ellipsoids.py), else 0. Fields of outputs follow.
     """
 
     def __init__(self, effects: Iterable[str], outputs: Iterable[str] = ()) -> None:
-        # first, so that these fields start at a line
-        whole = [name for effect in effects for name in _WHOLE.get(effect, ())]
+        # fields that are loaded as a vec4 are first
+        aligned = [name for effect in effects for name in _ALIGNED.get(effect, ())]
         extra = [name for effect in effects for name in _EXTRA.get(effect, ())]
         if "rays" not in effects:
-            whole += _EDGES if any(name in effects for name in BOXES) else ()
+            aligned += _EDGES if any(name in effects for name in BOXES) else ()
         elif "footprint_mixed" in effects:
             extra.append("boxed")
-        extra += [name for each in outputs for name in output.declared(each).record]
-        self.names = [*_FORMS, *whole, "columns", "rows", *extra]
-        self.lines = -(-len(self.names) // 4)
+        extra += [name for file in outputs for name in output.declared(file).record]
+        self.names = [*_FORMS, *aligned, "columns", "rows", *extra]
+        self.vec4s = -(-len(self.names) // 4)
 
     def position(self, name: str) -> tuple[int, int]:
-        """Line and lane of a number; (0, 0) for a number that the record lacks, which no kernel reads."""
+        """Index of the vec4 of a number, and of its component in the vec4; (0, 0) for a number that the
+        record lacks, which no kernel reads."""
         return divmod(self.word(name), 4)
 
     def word(self, name: str) -> int:

@@ -20,7 +20,7 @@ STAGED = 128
 _SHARED_MEMORY = """
 #if defined(__CUDA_ARCH__)
     // records; 16 bytes for each cell, a bit for each splat that can touch it; its list, a byte for each
-    __shared__ float4 staged[SPLATS * LINES + CELLS + (CELLS * STRIDE + 15) / 16];
+    __shared__ float4 staged[SPLATS * VEC4S + CELLS + (CELLS * STRIDE + 15) / 16];
     return static_cast<wp::uint64>(__cvta_generic_to_shared(staged));
 #else
     return 0;
@@ -31,10 +31,10 @@ _STAGE = """
     // all that was staged before is read by then
     if (!__syncthreads_or(open)) return false;
     float4* staged = reinterpret_cast<float4*>(__cvta_shared_to_generic(shared_memory));
-    const float4* from = reinterpret_cast<const float4*>(lines.data);
-    // line by line, so that neighbours in the block read neighbours in memory
-    for (int k = threadIdx.x; k < length * LINES; k += blockDim.x)
-        staged[k] = __ldg(from + static_cast<size_t>(lists.data[first + k / LINES]) * LINES + k % LINES);
+    const float4* from = reinterpret_cast<const float4*>(records.data);
+    // in the order of memory, so that neighbours in the block read neighbours in memory
+    for (int k = threadIdx.x; k < length * VEC4S; k += blockDim.x)
+        staged[k] = __ldg(from + static_cast<size_t>(lists.data[first + k / VEC4S]) * VEC4S + k % VEC4S);
     __syncthreads();
     return true;
 #else
@@ -44,7 +44,7 @@ _STAGE = """
 _MARK_CELLS = """
 #if defined(__CUDA_ARCH__)
     float4* staged = reinterpret_cast<float4*>(__cvta_shared_to_generic(shared_memory));
-    unsigned int* touched = reinterpret_cast<unsigned int*>(staged + SPLATS * LINES);
+    unsigned int* touched = reinterpret_cast<unsigned int*>(staged + SPLATS * VEC4S);
     const unsigned int lane = threadIdx.x & 31;
     // 32 splats by 32 cells, turned: in each step squares of bits change places across the diagonal
     unsigned int bits = cells;
@@ -62,9 +62,9 @@ _LIST_CELL = """
     // all are marked by then
     __syncthreads();
     const uint4* touched =
-        reinterpret_cast<const uint4*>(__cvta_shared_to_generic(shared_memory)) + SPLATS * LINES;
+        reinterpret_cast<const uint4*>(__cvta_shared_to_generic(shared_memory)) + SPLATS * VEC4S;
     unsigned char* list = reinterpret_cast<unsigned char*>(__cvta_shared_to_generic(shared_memory))
-                          + 16 * (SPLATS * LINES + CELLS) + cell * STRIDE;
+                          + 16 * (SPLATS * VEC4S + CELLS) + cell * STRIDE;
     const uint4 bits = touched[cell];
     // words that a longer batch has left
     const unsigned int words[4] = {
@@ -92,18 +92,18 @@ _LIST_CELL = """
 _CELL_SPLAT = """
 #if defined(__CUDA_ARCH__)
     return (reinterpret_cast<const unsigned char*>(__cvta_shared_to_generic(shared_memory))
-            + 16 * (SPLATS * LINES + CELLS))[cell * STRIDE + k];
+            + 16 * (SPLATS * VEC4S + CELLS))[cell * STRIDE + k];
 #else
     return k;
 #endif
 """
-_LINE = """
+_STAGED_VEC4 = """
 #if defined(__CUDA_ARCH__)
     const float4* staged = reinterpret_cast<const float4*>(__cvta_shared_to_generic(shared_memory));
-    const float4 quad = staged[which * LINES + line];
+    const float4 quad = staged[which * VEC4S + at];
     return wp::vec_t<4, wp::float32>(quad.x, quad.y, quad.z, quad.w);
 #else
-    return lines.data[lists.data[first + which] * LINES + line];
+    return records.data[lists.data[first + which] * VEC4S + at];
 #endif
 """
 _ALONE = """
@@ -123,12 +123,12 @@ def alone() -> bool:
 
 def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespace:
     """Make functions that stage batches of records in shared memory: shared_memory; stage, mark_cells and
-    list_cell, called for each batch; cell_splat and line.
+    list_cell, called for each batch; cell_splat and staged_vec4.
 
     layout: layout of the records. cells: cells per tile. items: threads of a warp per cell.
     """
     # padded, so that words of a list are in different banks
-    numbers = {"SPLATS": STAGED, "LINES": layout.lines, "CELLS": cells, "ITEMS": items, "STRIDE": STAGED + 4}
+    numbers = {"SPLATS": STAGED, "VEC4S": layout.vec4s, "CELLS": cells, "ITEMS": items, "STRIDE": STAGED + 4}
 
     @wp.func_native(with_numbers(_SHARED_MEMORY, numbers))
     def shared_memory() -> wp.uint64:
@@ -138,7 +138,7 @@ def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespac
     @wp.func_native(with_numbers(_STAGE, numbers))
     def stage(
         shared_memory: wp.uint64,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         first: int,
         length: int,
@@ -168,16 +168,16 @@ def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespac
         """Index in the batch of the k-th splat in the list of a cell."""
         ...
 
-    @wp.func_native(with_numbers(_LINE, numbers))
-    def line(
+    @wp.func_native(with_numbers(_STAGED_VEC4, numbers))
+    def staged_vec4(
         shared_memory: wp.uint64,
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         first: int,
         which: int,
-        line: int,
+        at: int,
     ) -> wp.vec4:
-        """A line of the record of the staged splat `which`."""
+        """The 16 bytes `at` of the record of the staged splat `which`."""
         ...
 
     return SimpleNamespace(
@@ -186,5 +186,5 @@ def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespac
         mark_cells=mark_cells,
         list_cell=list_cell,
         cell_splat=cell_splat,
-        line=line,
+        staged_vec4=staged_vec4,
     )

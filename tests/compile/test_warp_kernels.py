@@ -189,12 +189,12 @@ def test_derivatives_read_records_where_they_lie(tmp_path):
 
 def test_a_record_grows_by_the_requested_fields():
     layout = runtime.kernels("records").RecordLayout
-    assert layout(()).lines == 5
+    assert layout(()).vec4s == 5
     assert layout(("lowpass_screen",)).names[-2:] == ["lowpass_x", "lowpass_y"]
-    assert layout(RECORD, NORMAL).lines == 7
+    assert layout(RECORD, NORMAL).vec4s == 7
     assert layout(RECORD, NORMAL).position("nz") == (6, 2)
     assert layout(()).position("nz") == (0, 0)
-    assert layout(("lowpass_screen", "footprint_mixed")).lines == 6
+    assert layout(("lowpass_screen", "footprint_mixed")).vec4s == 6
     assert layout(("footprint_box",)).position("edge_u0") == (4, 0), "a line of their own"
     assert layout(("rays", "footprint_box")).names == layout(("rays",)).names, "edges are curves"
     assert "boxed" in layout(("rays", "footprint_mixed")).names

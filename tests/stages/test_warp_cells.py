@@ -27,27 +27,27 @@ def marked(frame):
     )
     cells = runtime.kernels("cells").make_cells(effects, outputs)
     staging = runtime.kernels("staging").make_staging(program.layout, 32, 4)
-    staged = runtime.kernels("splat").make_splat(effects, outputs).reading(staging.line)
+    staged = runtime.kernels("splat").make_splat(effects, outputs).make_readers(staging.staged_vec4)
     load, box_of = staged.load, staged.box_of
 
     @wp.kernel(module="unique", enable_backward=False)
     def ask(
         views: wp.array(dtype=runtime.kernels("common").View),
-        lines: wp.array(dtype=wp.vec4),
+        records: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         found: wp.array2d(dtype=wp.uint32),
     ):
         k, tile = wp.tid()
         view = views[0]
-        s = load(wp.uint64(0), lines, lists, k, 0, view)
-        box = box_of(wp.uint64(0), lines, lists, k, 0)
+        s = load(wp.uint64(0), records, lists, k, 0, view)
+        box = box_of(wp.uint64(0), records, lists, k, 0)
         left, top = tile % view.tiles_x * view.tile_w, tile / view.tiles_x * view.tile_h
         found[k, tile] = cells(s, box, left, top, 0, view)
 
     count = frame.resident.count
     found = wp.zeros((count, frame.tiles), dtype=wp.uint32, device="cpu")
     held, lists = frame.named, wp.array(np.arange(count), dtype=wp.int32, device="cpu")
-    wp.launch(ask, found.shape, [held["views"], held["lines"], lists, found], device="cpu")
+    wp.launch(ask, found.shape, [held["views"], held["records"], lists, found], device="cpu")
     return (found.numpy()[:, :, None] >> np.arange(32) & 1).astype(bool)
 
 
@@ -78,8 +78,8 @@ def test_marked_cells_contain_all_fragments_and_few_others(renderer, cloud, qual
     frame = backend.pipeline(features).render_counted(resident, view)[0]
     visible = frame.named["keys"].numpy()[: resident.count] != 0xFFFFFFFF
     actual = marked(frame)[visible]
-    lines = frame.named["lines"].numpy()[: resident.count * frame.program.layout.lines]
-    records = lines.reshape(resident.count, -1)[visible]
+    vec4s = frame.named["records"].numpy()[: resident.count * frame.program.layout.vec4s]
+    records = vec4s.reshape(resident.count, -1)[visible]
     expected = covered(records, frame.program.layout.names, view, *frame.grid)
     assert not (expected & ~actual).any()
     assert actual.sum() < MORE[cloud] * expected.sum()

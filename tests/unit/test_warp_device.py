@@ -393,7 +393,7 @@ def test_poison_reaches_every_array(renderer, monkeypatch):
     monkeypatch.setattr(probe, "poison", lambda array: measured.append(poison(array)) or measured[-1])
     with renderer.backend.probe().poisoned():
         renderer.render(CLOUD, CAMERA, ("rgb", "depth"))
-        again = renderer.backend.pool.scratch("lines", 4, wp.vec4)
+        again = renderer.backend.pool.scratch("records", 4, wp.vec4)
     assert len(measured) > 15
     assert (again.numpy().view(np.uint8) == 0xFF).all()
 

@@ -137,7 +137,7 @@ class DeviceFrame:
         for name, size in {"starts": 1, "cursors": 0, "tile_order": 0}.items():
             self._scratch(name, self.tiles + size, wp.int32)
         self._scratch("bounds", n, kernels("bounds").Bounds)
-        self._scratch("lines", n * program.layout.lines, wp.vec4)
+        self._scratch("records", n * program.layout.vec4s, wp.vec4)
         self.launcher.stage("project")
         visible, pairs = self._project()
         samples = self._samples("raw")

@@ -31,8 +31,8 @@ class MemoryPlanner:
         self._tile_width, self._tile_height = config.tile_width, config.tile_height
         sizes = map(load().types.type_size_in_bytes, program.sample_fields.values())
         self._sample_bytes = sum(sizes)
-        self._lines = program.layout.lines
-        self._splat_bytes = 16 * self._lines + _BOUNDS + _PROJECTED
+        self._vec4s = program.layout.vec4s
+        self._splat_bytes = 16 * self._vec4s + _BOUNDS + _PROJECTED
         self._same_settings = program.sensor is not None
         """whether the views of a part must have equal camera parameters"""
 
@@ -70,5 +70,5 @@ class MemoryPlanner:
         free = workspace.memory_budget - resident.memory_bytes - reserved
         # half of the budget is for the lists
         fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each
-        numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._lines)
+        numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._vec4s)
         return even_ranges(count, max(1, min(fitting, numbered)))

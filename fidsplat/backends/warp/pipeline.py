@@ -116,12 +116,12 @@ class WarpPipeline(Pipeline):
         named, stats, n = frame.named, images.stats, resident.count
         rows, stride = frame.grid
         raw = named["raw color"].numpy()[: rows * stride]
-        lines = named["lines"].numpy()[: n * self.program.layout.lines]
+        records = named["records"].numpy()[: n * self.program.layout.vec4s]
         return {
             "keys": named["keys"].numpy()[:n].copy(),
             "starts": named["starts"].numpy()[: frame.tiles + 1].astype(np.uint32),
             "lists": named["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
-            "records": lines.reshape(n, -1).copy(),
+            "records": records.reshape(n, -1).copy(),
             "raw": raw.reshape(rows, stride, 4).transpose(2, 0, 1).copy(),
             **{output.name: images.read(output.name, 0) for output in self.program.images},
         }

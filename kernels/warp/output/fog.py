@@ -36,7 +36,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def background_share(grid: PixelGrid, samples: Any) -> float:
-    """SplatRange of the background in a pixel, as the fog has the background colour."""
+    """Fraction of the background colour that the fog, which has this colour, adds to a pixel."""
     fogged = float(0.0)
     for k in range(grid.count):
         fogged += samples.fogged[sample_at(grid, k)]
@@ -46,7 +46,7 @@ def background_share(grid: PixelGrid, samples: Any) -> float:
 OUTPUT = Output(
     depth=True,
     length=True,
-    # fog_slope: -density, per metre of depth; fogged: sum of weights times absorbed share
+    # fog_slope: -density, per metre of depth; fogged: sum of weights times absorbed fraction
     state={"fog_slope": wp.float32, "fogged": wp.float32},
     start=start,
     composite=composite,
