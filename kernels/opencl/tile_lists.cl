@@ -364,9 +364,9 @@ static inline void sort_buckets(global const ulong *pairs, uint length, local ul
 ) {
     for (uint k = get_local_id(0); k < length; k += SORT_ITEMS) {
         ulong pair = BUCKETED(k);
-        uint range = bucket_of(pair, nearest, scale), first = range > 0 ? buckets->starts[range - 1] : 0, position = first;
+        uint bucket = bucket_of(pair, nearest, scale), first = bucket > 0 ? buckets->starts[bucket - 1] : 0, position = first;
 //@@ equal_start
-        for (uint other = first, end = buckets->starts[range]; other < end; other++) COUNT_BEFORE(position, BUCKETED(other), pair);
+        for (uint other = first, end = buckets->starts[bucket]; other < end; other++) COUNT_BEFORE(position, BUCKETED(other), pair);
 //@@ equal_sorted
         list[position] = (uint)pair;
     }

@@ -1,4 +1,4 @@
-// blended (h, w) int: number of composited fragments, each of a layer counted; the maximum over a pixel's samples.
+// blended (h, w) int: number of composited fragments, including each fragment of a layer; the maximum over a pixel's samples.
 //@ state
     vint blended;
 //@ start

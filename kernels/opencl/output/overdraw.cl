@@ -1,4 +1,4 @@
-// overdraw (h, w) int: number of composited fragments of a pixel's samples, those of a layer included. Internal; `fidsplat bench`
+// overdraw (h, w) int: number of composited fragments of a pixel's samples, including each fragment of a layer. Internal; `fidsplat bench`
 // reports it as the blending work of a frame.
 //@ state
     vint overdraw;

@@ -1,9 +1,9 @@
-// Inverse lookup table of a lens: image bounds of a region of ray directions. Two coordinates of a direction, which each lens defines
-// (its file says which), are divided into a grid of cells. For each cell `inverse_lens_lut` stores the first and last column and row of the samples whose rays are inside; coarser grids, each of
+// Inverse lookup table of a lens: image bounds of a region of ray directions. Two coordinates of a direction, which each lens
+// defines in its file, are divided into a grid of cells. For each cell `inverse_lens_lut` stores the first and last column and row of the samples whose rays are inside; coarser grids, each of
 // half the resolution, follow. The bounds are valid for arbitrary rays.
 //@ camera
 // Bounds of the samples whose rays are in [x0, x1] x [y0, y1] of the table; empty if there are none. numbers: low corner, cells per
-// unit along x and y, cells per side, first row of this image in the map.
+// unit along x and y, cells per side, first row of this image in the table's image.
 static inline Bounds lens_lut_bounds(global const real *numbers, global const short4 *map, real x0, real x1, real y0, real y1) {
     real cells = numbers[4];
     // margin of 0.02 cells for the rounding of the coordinates

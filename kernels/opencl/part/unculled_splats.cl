@@ -29,7 +29,7 @@ static inline bool pair_before(ulong a, ulong b
 //@ equal_start
         uint equal = 0;
 //@ equal_sorted
-        for (uint other = first; equal > 1 && other < buckets->starts[range]; other++)
+        for (uint other = first; equal > 1 && other < buckets->starts[bucket]; other++)
             position += BUCKETED(other) >> 32 == pair >> 32 && PAIR_BEFORE(BUCKETED(other), pair);
 //@ project_kernels
 // Index space: one work-item per group of splats, in work-groups of CULL_ITEMS.

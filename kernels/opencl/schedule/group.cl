@@ -1,5 +1,5 @@
 // Blend stage for GPUs: one work-group per tile, ROWS pixels of a column per work-item; splats are staged in local memory.
-// Barriers are only in loops with the same bounds for the complete group.
+// Barriers are only in loops with the same bounds for the complete work-group.
 //
 // ITEMS neighbouring work-items share a cell of CELL_W x CELL_H pixels and loop over those staged splats that overlap the cell:
 // the cells of one warp have lists of their own.

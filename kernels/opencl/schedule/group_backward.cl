@@ -2,7 +2,7 @@
 // checkpoint per pixel and SEGMENT splats: the transmittance in front of them, and the gradient with respect to the one behind. Segments are
 // then independent: each work-group of `blend_backward` processes one, so that long lists occupy many groups. Sums over
 // work-items are per splat, in a fixed order and without atomics.
-// Barriers are only where the complete group reaches them.
+// Barriers are only where the complete work-group reaches them.
 #define PIXELS (TILE_W * TILE_H)
 #define PARTS (GROUP + 1)                    // per field: one more than GROUP, against bank conflicts
 #define PREFETCH_CHUNKS 8                       // loaded at once

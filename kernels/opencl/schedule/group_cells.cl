@@ -52,7 +52,7 @@ static inline void touched_cells(local const Splat *s, int left, int top, blend_
     }
 }
 
-// Finds the cells of all `length` staged splats. Called by the complete group, before a barrier and list_cell.
+// Finds the cells of all `length` staged splats. Called by the complete work-group, before a barrier and list_cell.
 static inline void find_cells(local const Staged *staged, uint length, int left, int top, const BlendConstants *constants,
                               local uint *cells, local uint (*touched)[ITEMS]
 //@@ cells_parameters
@@ -79,7 +79,7 @@ static inline void find_cells(local const Staged *staged, uint length, int left,
 #endif
 }
 
-// Lists the staged splats that overlap a cell, in order. Called by the complete group; `cell_item` is the index of the work-item in its
+// Lists the staged splats that overlap a cell, in order. Called by the complete work-group; `cell_item` is the index of the work-item in its
 // cell. touched, cell_splats: of this cell. Returns the number of splats.
 static inline uint list_cell(local const uint *cells, uint cell_x, uint cell_y, uint cell_item, uint length, local uint *touched,
                              local uchar *cell_splats) {

@@ -2,7 +2,7 @@
 // work-item is enough.
 // Index space: one work-item (and work-group) per core.
 // Reads:  splats, lists, starts[tiles + 1], windows, big_rows, gradient_offsets, and the gradients of the images.
-// Writes: record_gradients of each splat of the tile; background_sums. Reads and overwrites: checkpoints, tapes; reserved[1], the number of tiles taken.
+// Writes: record_gradients of each splat of the tile; background_sums. Reads and overwrites: checkpoints, tapes; reserved[1], the number of tiles that work-items have taken.
 // Splats are scattered in memory, so the next ones are prefetched.
 #define PREFETCH_SPLATS 8
 

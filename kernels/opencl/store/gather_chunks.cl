@@ -17,7 +17,7 @@ kernel void gather(global const uint *source, global const uint4 *copies, uint w
 #if APPLIES_POSES
 #define NO_POSE 0xffffffffu
 
-// A row of means (width 3) or quaternions (width 4). Bit-identical to `moved` (fidsplat/store/subset.py): sums have the same
+// A row of means (width 3) or quaternions (width 4). Bit-identical to `transformed` (fidsplat/store/partial_cloud.py): sums have the same
 // order. Words of a pose: rotation by rows, translation of the origin of the means, quaternion.
 // Index space: (rows of the largest copy, copies).
 kernel void gather_posed(
