@@ -114,8 +114,8 @@ def choose(
     bases, content = [requested.quality], splats
     if isinstance(splats, ChunkedSplats):
         content = splats.content
-        # levels of detail may use half of the error, and the search measures the sum: errors that the store
-        # measured from other views are no bound
+        # levels of detail may use half of the error; the search measures the sum, since errors that `store
+        # measure` found in other views do not bound the error of this view
         allowed = [0.0, *DETAIL_ERRORS] if error is None else [min(max(error, 0) / 2, DETAIL_ERRORS[-1]), 0.0]
         bases = [_with_detail(splats, requested.quality, detail) for detail in allowed]
         requested = replace(requested, quality=requested.quality.with_(detail_error=0.0))

@@ -39,7 +39,7 @@ class Capture(PickledByFields):
     background: Background = (0.0, 0.0, 0.0)
     """behind the splats: RGB in display space, a Gradient or a Panorama"""
     motion: Motion = _MOTION
-    """motion of the camera and of groups of splats; None: no motion"""
+    """motion of the camera and of groups of splats; None is replaced by an empty Motion"""
     shutter: Shutter = _SHUTTER
     """time, exposure and readout; None: an instant at time 0"""
     sensor: Sensor = _SENSOR

@@ -137,7 +137,7 @@ def find_checkpoint(source: Path) -> Path | None:
     files = sorted(source.glob(f"*{CHECKPOINT}")) if source.is_dir() else []
     if len(files) > 1:
         names = ", ".join(file.name for file in files)
-        raise InputError(f"{source} must hold one training run, got several; name one of {names} there")
+        raise InputError(f"{source} must contain one training run, got several; name one of {names} there")
     return files[0] if files else None
 
 
@@ -155,8 +155,8 @@ def flight_source(folder: Path) -> tuple[str, str]:
         file = folder / source
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(
-            f"a folder to view must hold *{CHECKPOINT} of `fidsplat train` or a {RECORD} of `fidsplat fly` "
-            f"that names its scene, got {folder}; to view a scene, give its file"
+            f"a folder to view must contain *{CHECKPOINT} of `fidsplat train` or a {RECORD} of `fidsplat "
+            f"fly` that names its scene, got {folder}; to view a scene, give its file"
         ) from None
     if not file.exists():
         raise InputError(

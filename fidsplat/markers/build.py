@@ -199,7 +199,7 @@ class Marker(PickledByFields):
 
     @cached_property
     def polygons(self) -> list[Polygon]:
-        """Polygons with holes of the components, in modules of the grid (needs shapely)."""
+        """Polygons of the components, with holes, in modules of the grid (needs shapely)."""
         if self.regions is not None:
             return [polygon for region in self.regions for polygon in region.geoms]
         return polygons(self.grid, self.labels, self.components)

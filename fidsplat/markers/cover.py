@@ -169,7 +169,8 @@ def _widths(sides: _Sides, edges: np.ndarray, tree: shapely.STRtree) -> np.ndarr
 
 
 def _rectangles(sides: _Sides, width: np.ndarray) -> np.ndarray:
-    """Corners (n, 4, 2) of rectangles over each side with its width and the sector at its concave corner."""
+    """Corners (n, 4, 2) of a rectangle inwards from each side, of its width, prolonged over the sector at the
+    side's concave corner."""
     inward = width[:, None] * np.column_stack([np.cos(sides.inward), np.sin(sides.inward)])
     ahead = np.sin(sides.turn)[:, None] * np.column_stack([inward[:, 1], -inward[:, 0]])
     stop = sides.stop + ahead

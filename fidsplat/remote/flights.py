@@ -108,7 +108,7 @@ def _checked(files: Any, k: int, outputs: Sequence[str]) -> Files:
     complete = isinstance(files, dict) and files.keys() == expected
     if not complete or not all(isinstance(content, bytes) and content for content in files.values()):
         raise FidsplatError(
-            f"the reply of a worker must be the files of the outputs of image {k}, got something else; "
+            f"the reply of a worker must be the files of the outputs of image {k}, got other data; "
             "install the same fidsplat there"
         )
     return files

@@ -21,8 +21,8 @@ from fidsplat.splats.cloud import SplatCloud
 
 NAN, INF = float("nan"), float("inf")
 DENORMAL = 1e-45
-VICTIM = 7
-"""index of the splat whose fields are corrupted (the victim)"""
+CORRUPTED = 7
+"""index of the splat whose fields are corrupted"""
 VIEW = camera(60, 45, 48.0)
 
 BROKEN = {
@@ -44,18 +44,18 @@ ODD = {
 
 
 def crowd() -> SplatCloud:
-    """A cloud in which the splat `VICTIM` covers the image centre."""
+    """A cloud in which the splat `CORRUPTED` covers the image centre."""
     cloud = random_splats(40, 41, depth=(1.0, 5.0), scale=(0.03, 0.4), across=1.0)
-    victim = splats([[0.05, 0.02, 1.2]], rotation((1, 1, 0), 30), (0.3, 0.2), 0.9, (0.2, 0.9, 0.4))
-    before, after = subset_of(cloud, np.arange(VICTIM)), subset_of(cloud, np.arange(VICTIM, len(cloud)))
-    return SplatCloud.concatenate([before, victim, after])
+    in_front = splats([[0.05, 0.02, 1.2]], rotation((1, 1, 0), 30), (0.3, 0.2), 0.9, (0.2, 0.9, 0.4))
+    before, after = subset_of(cloud, np.arange(CORRUPTED)), subset_of(cloud, np.arange(CORRUPTED, len(cloud)))
+    return SplatCloud.concatenate([before, in_front, after])
 
 
 def corrupted(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
-    """A copy of the cloud with changed fields of the splat `VICTIM`, which is dropped if it is invalid."""
+    """A copy of the cloud with changed fields of the splat `CORRUPTED`, which is dropped if it is invalid."""
     arrays = {name: getattr(cloud, name).copy() for name in BROKEN}
     for name, value in changes.items():
-        arrays[name][VICTIM] = value
+        arrays[name][CORRUPTED] = value
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return SplatCloud(**arrays, labels=cloud.labels)
@@ -64,7 +64,7 @@ def corrupted(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
 def broken_fields(cloud: SplatCloud) -> Iterator[tuple[str, dict[str, Any]]]:
     """Name and changed fields, for each field, component and broken value."""
     for name, values in BROKEN.items():
-        field = getattr(cloud, name)[VICTIM]
+        field = getattr(cloud, name)[CORRUPTED]
         for value in values:
             for k in range(max(field.size, 1)):
                 changed = np.array(field)
@@ -85,7 +85,7 @@ def e1(renderer: Renderer) -> Found:
     cloud = crowd()
     for name, values in ODD.items():
         for value in values:
-            field = np.array(getattr(cloud, name)[VICTIM])
+            field = np.array(getattr(cloud, name)[CORRUPTED])
             field[0 if field.ndim else ()] = value
             outputs = ALL_OUTPUTS if name == "scales" else ("rgb", "alpha")
             yield FrameSpec(corrupted(cloud, {name: field}), VIEW, outputs=outputs)
@@ -93,7 +93,7 @@ def e1(renderer: Renderer) -> Found:
     yield FrameSpec(corrupted(cloud, {"means": (0.0, 0.0, 1e15), "scales": 1e15}), VIEW)
     yield FrameSpec(corrupted(cloud, {"means": (1e15, -1e15, 1e15)}), VIEW)
     cloud = crowd()
-    without = subset_of(cloud, np.delete(np.arange(len(cloud)), VICTIM))
+    without = subset_of(cloud, np.delete(np.arange(len(cloud)), CORRUPTED))
     expected = renderer.render(without, VIEW, ALL_OUTPUTS)
     different = miscounted = tried = 0
     for _, changes in broken_fields(cloud):

@@ -59,7 +59,7 @@ class Localiser:
 
     @property
     def relative(self) -> np.ndarray:
-        """(4, 4) pose of the robot in its pose at the reference scan."""
+        """(4, 4) pose of the robot relative to its pose at the reference scan."""
         return np.linalg.inv(_pose(self._reference)) @ self.pose
 
     def move(self, wheels: np.ndarray, gyro: float, seconds: float) -> None:

@@ -31,7 +31,7 @@ class PartialCloud(SplatCloud):
         return part
 
     def __reduce__(self):
-        """Pickled and copied as a plain SplatCloud."""
+        """Pickle and copy the splats as a plain SplatCloud."""
         return _cloud_of, ({field.name: getattr(self, field.name) for field in fields(self)},)
 
     @property

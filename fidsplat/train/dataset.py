@@ -199,14 +199,14 @@ def viewed_cube(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, bool
     return focus - reach, focus + reach, bool(along.mean() > _FACING * distances.mean())
 
 
-def _points_in_frustums(cameras: Sequence[Camera], draws: np.ndarray, depth: float) -> np.ndarray:
+def _points_in_frustums(cameras: Sequence[Camera], random_numbers: np.ndarray, depth: float) -> np.ndarray:
     """Points (n, 3) in the frustums of the cameras, round robin, up to a depth [m].
 
-    draws: (n, 3) random numbers in (0, 1).
+    random_numbers: (n, 3) in (0, 1).
     """
-    points = np.empty(draws.shape)
+    points = np.empty(random_numbers.shape)
     for number, camera in enumerate(cameras):
-        mine = draws[number :: len(cameras)]
+        mine = random_numbers[number :: len(cameras)]
         rays = camera.rays(mine[:, :2] * (camera.width, camera.height)) * (mine[:, 2:] * depth)
         points[number :: len(cameras)] = camera.position + rays @ camera.world_to_camera[:3, :3]
     return points

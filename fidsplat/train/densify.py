@@ -130,8 +130,8 @@ def _split_values(
     scales = np.exp(values["log_scales"]).astype(np.float64)
     axes = scales.shape[1]
     directions = quaternion_to_matrix(values["quats"])[:, :, :axes]
-    calls = range(-(-COPIES * axes // 4))  # four numbers each
-    draws = np.hstack([normal(settings.seed, RandomStream.SPLITS, iteration, splits, draw) for draw in calls])
+    calls = range(-(-COPIES * axes // 4))  # `normal` returns four numbers for each splat
+    draws = np.hstack([normal(settings.seed, RandomStream.SPLITS, iteration, splits, call) for call in calls])
     means = np.concatenate([values["means"]] * COPIES)
     for copy in range(COPIES):
         offset = scales * draws[:, axes * copy : axes * (copy + 1)]

@@ -40,7 +40,7 @@ class Splats:
     """means (n, 3) metres relative to the origin, log_scales (n, 2) of disks or (n, 3) of 3D Gaussians, quats
     (n, 4) of any length, logits (n,) of the opacities, sh (n, k, 3)"""
     first: Arrays
-    """Adam's first moments, in the same shapes"""
+    """Adam's first moments, with the shapes of `values`"""
     second: Arrays
     """Adam's second moments"""
     gradient_sums: np.ndarray

@@ -54,7 +54,7 @@ def demo_scene(seed: int = 0, mixture: str = "exact") -> Scene:
 
 
 def sunlit(scene: Scene) -> Scene:
-    """The scene with signs that are lit by it and by a sun over the viewer's right shoulder."""
+    """The scene with signs that are lit by the scene and by a sun over the viewer's right shoulder."""
     signs = tuple(replace(placed, light="scene") for placed in scene.markers)
     return replace(scene, markers=signs, lights=(SUN,))
 

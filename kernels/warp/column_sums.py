@@ -42,7 +42,8 @@ def background_parts(
     threads: int,  # number of threads
     color: wp.array(dtype=wp.vec4),  # samples: r, g, b, transmittance
     grad_rgb: wp.array(dtype=wp.float32),  # (h w 3)
-    parts: wp.array(dtype=wp.float64),  # (threads, 3) out: gradients with respect to the background
+    # (threads, 3) out: partial sums of the gradient with respect to the background
+    parts: wp.array(dtype=wp.float64),
 ):
     thread = first + wp.tid()
     total = wp.vec3d()

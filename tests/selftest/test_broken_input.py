@@ -8,7 +8,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.selftest.agreement import ALL_OUTPUTS, CATALOGUED
 from fidsplat.selftest.clouds import subset_of
-from fidsplat.selftest.inputs import BROKEN, VICTIM, VIEW, broken_fields, corrupted, crowd
+from fidsplat.selftest.inputs import BROKEN, CORRUPTED, VIEW, broken_fields, corrupted, crowd
 
 NAN, INF = float("nan"), float("inf")
 ALL_ZERO_ROWS = 889_536
@@ -19,8 +19,8 @@ def same_bits(first, second):
     return all(np.array_equal(first[name], second[name]) for name in ALL_OUTPUTS)
 
 
-def without_victim(cloud):
-    return subset_of(cloud, np.delete(np.arange(len(cloud)), VICTIM))
+def without_corrupted(cloud):
+    return subset_of(cloud, np.delete(np.arange(len(cloud)), CORRUPTED))
 
 
 def expected_reason(name, value):
@@ -37,7 +37,7 @@ def expected_reason(name, value):
 def test_each_broken_value_is_counted_under_its_reason(name):
     cloud = crowd()
     for value in BROKEN[name]:
-        field = np.array(getattr(cloud, name)[VICTIM])
+        field = np.array(getattr(cloud, name)[CORRUPTED])
         field[0 if field.ndim else ()] = value
         assert corrupted(cloud, {name: field}).dropped == {expected_reason(name, value): 1}, value
 
@@ -47,7 +47,9 @@ def test_all_broken_values_at_once(renderer):
     cloud = crowd()
     bad = [arrays for _, arrays in broken_fields(cloud)]
     arrays = {name: getattr(cloud, name) for name in BROKEN}
-    rows = {name: np.repeat(array[VICTIM : VICTIM + 1], len(bad), axis=0) for name, array in arrays.items()}
+    rows = {
+        name: np.repeat(array[CORRUPTED : CORRUPTED + 1], len(bad), axis=0) for name, array in arrays.items()
+    }
     for row, changes in enumerate(bad):
         for name, value in changes.items():
             rows[name][row] = value
@@ -69,8 +71,8 @@ def test_broken_spherical_harmonics(renderer, degree, value):
     generator = np.random.default_rng(1)
     sh = generator.normal(0, 0.3, (len(cloud), (degree + 1) ** 2, 3)).astype(np.float32)
     fields = (cloud.means, cloud.quats, cloud.scales, cloud.opacities)
-    good = without_victim(fs.SplatCloud(*fields, sh=sh))
-    sh[VICTIM, -1, 2] = value
+    good = without_corrupted(fs.SplatCloud(*fields, sh=sh))
+    sh[CORRUPTED, -1, 2] = value
     with pytest.warns(UserWarning, match="1 of 41"):
         bad = fs.SplatCloud(*fields, sh=sh)
     frames = [renderer.render(c, VIEW) for c in (bad, good)]
@@ -89,11 +91,11 @@ UNCHECKED = {
 def test_kernels_cull_invalid_splats(renderer, name):
     """Case E1: NaN fails every comparison of the kernels; the checks of the cloud are bypassed."""
     cloud = crowd()
-    expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS)
+    expected = renderer.render(without_corrupted(cloud), VIEW, ALL_OUTPUTS)
     for value in UNCHECKED[name]:
-        for k in range(max(getattr(cloud, name)[VICTIM].size, 1)):
+        for k in range(max(getattr(cloud, name)[CORRUPTED].size, 1)):
             array = getattr(cloud, name).copy()
-            array[(VICTIM, k) if array.ndim > 1 else VICTIM] = value
+            array[(CORRUPTED, k) if array.ndim > 1 else CORRUPTED] = value
             frame = renderer.render(cloud._replaced(**{name: array}), VIEW, ALL_OUTPUTS)
             assert same_bits(frame, expected), f"{name}[{k}] = {value}"
             assert frame.stats["visible"] == expected.stats["visible"]
@@ -102,9 +104,9 @@ def test_kernels_cull_invalid_splats(renderer, name):
 def test_kernels_cull_a_zero_quaternion(renderer):
     cloud = crowd()
     quats = cloud.quats.copy()
-    quats[VICTIM] = 0
+    quats[CORRUPTED] = 0
     frame = renderer.render(cloud._replaced(quats=quats), VIEW, ALL_OUTPUTS)
-    assert same_bits(frame, renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS))
+    assert same_bits(frame, renderer.render(without_corrupted(cloud), VIEW, ALL_OUTPUTS))
 
 
 def test_minus_zero_is_zero(renderer):
@@ -119,7 +121,7 @@ def test_minus_zero_is_zero(renderer):
 def test_invisible_splats_change_nothing(renderer):
     """Opacity 0, -0, denormal, and below the cut-off: valid invisible splats."""
     cloud = crowd()
-    expected = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
+    expected = renderer.render(without_corrupted(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
     for opacity in (0.0, -0.0, 1e-45, 1e-30, 0.0039):
         visible = corrupted(cloud, {"opacities": opacity})
         frame = renderer.render(visible, VIEW, ALL_OUTPUTS, CATALOGUED)

@@ -82,14 +82,14 @@ def test_paths_that_are_not_runs_are_reported(flight, capsys):
     (flight.parents[1] / "scene.toml").unlink()
     for folder, words in (
         (flight, "the scene of the flight"),
-        (flight.parent, "a folder to view must hold"),
+        (flight.parent, "a folder to view must contain"),
     ):
         assert main(["view", str(folder)]) == 2
         assert words in capsys.readouterr().err
     for damaged in ("{", "[]", '{"source": null}'):
         (flight / "flight.json").write_text(damaged)
         assert main(["view", str(flight)]) == 2
-        assert "a folder to view must hold" in capsys.readouterr().err
+        assert "a folder to view must contain" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

@@ -45,9 +45,9 @@ class Adapter:
 
     def _claims(self, name: str) -> dict[str, dict]:
         """Settings that define the image, by kind of splats."""
-        claim = {field: getattr(self.qualities[name], field) for field in DEFINITION}
+        image_quality = {field: getattr(self.qualities[name], field) for field in DEFINITION}
         kinds = ("ellipsoids",) if name == EXACT else ("disks", "ellipsoids", "boxes")
-        return dict.fromkeys(kinds, claim)
+        return dict.fromkeys(kinds, image_quality)
 
     def load(self, scene: dict[str, np.ndarray]) -> None:
         size, matrix, near, self.poses = (scene.pop(name) for name in ("size", "matrix", "near", "poses"))

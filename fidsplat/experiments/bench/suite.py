@@ -197,11 +197,12 @@ class Measurement:
         )
         return {name: ms for name, ms in answer.items() if name != "ms"}
 
-    def first(self, references: References, claim: Mapping[str, Any], file: Path) -> np.ndarray:
-        """Render the first frames; adds times and errors to `result`, returns the first image (h, w, 3).
+    def first(self, references: References, image_quality: Mapping[str, Any], file: Path) -> np.ndarray:
+        """Render the first frame of the chosen views, add times and errors to `self.result`, and return the
+        first image (h, w, 3).
 
         Args:
-            claim: fields of `Quality` that define the image.
+            image_quality: fields of `Quality` that define the image.
             file: file by which the process returns images.
 
         Raises AdapterError.
@@ -214,7 +215,7 @@ class Measurement:
         self.second_ms = self.timer.run()
         if self.timer.error:
             raise AdapterError(self.timer.error)
-        off = np.abs(np.stack(images) - references.image(claim))
+        off = np.abs(np.stack(images) - references.image(image_quality))
         if not np.isfinite(off).all():
             raise AdapterError(f"{self.setting}: the image has values that are not finite")
         self.result |= {
@@ -256,18 +257,18 @@ class References:
         self._resident: Any = None
         self._found: dict[str, np.ndarray] = {}
 
-    def image(self, claim: Mapping[str, Any]) -> np.ndarray:
+    def image(self, image_quality: Mapping[str, Any]) -> np.ndarray:
         """Reference images (v, h, w, 3) float64 of the chosen views."""
-        claim = dict(claim)
-        if not self._views.cloud.has_coplanar_groups and claim.get("order") == "auto":
-            claim["order"] = "centre"  # renders the same image
+        image_quality = dict(image_quality)
+        if not self._views.cloud.has_coplanar_groups and image_quality.get("order") == "auto":
+            image_quality["order"] = "centre"  # renders the same image
         if self._views.kind != ELLIPSOIDS:
-            claim.pop("ellipsoid", None)
-        key = json.dumps(claim, sort_keys=True)
+            image_quality.pop("ellipsoid", None)
+        key = json.dumps(image_quality, sort_keys=True)
         if key not in self._found:
             if self._resident is None:
                 self._resident = self._renderer.upload(self._views.cloud)
-            quality = Quality().with_(**claim)
+            quality = Quality().with_(**image_quality)
             captures = (
                 Capture(self._views.camera.with_pose(self._views.poses[k]), quality=quality)
                 for k in self.chosen
@@ -439,16 +440,16 @@ class Suite:
         """Load a scene and render the first frames of each setting. Raises AdapterError."""
         process = self._process(renderer)
         measurements: list[Measurement] = []
-        settings = {key: claims for key, claims in process.settings.items() if views.kind in claims}
+        settings = {key: kinds for key, kinds in process.settings.items() if views.kind in kinds}
         reason = process.skipped or ("" if settings else f"does not render {views.kind}")
         if reason:
             self._add(name, [renderer], {"skipped": reason})
             return []
         loaded = process.ask("load", file=str(file))
-        for setting, claims in settings.items():
+        for setting, image_quality_of in settings.items():
             result = {"scene": name, "renderer": renderer, "setting": setting}
             measurement = Measurement(process, setting, result | loaded, submissions)
-            image = measurement.first(references, claims[views.kind], file.with_name("image.npy"))
+            image = measurement.first(references, image_quality_of[views.kind], file.with_name("image.npy"))
             if views.scene is not None:
                 readings, _ = read_back(np.clip(image, 0, 1), views.scene, views.camera)
                 measurement.result["tags"] = means(readings)

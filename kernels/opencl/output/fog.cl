@@ -2,7 +2,7 @@
 // fragment and layer. The fog's colour is the background.
 //@ state
     vfloat fog_slope;       // -density, per metre of depth
-    vfloat fogged;          // sum of weights times absorbed share
+    vfloat fogged;          // sum of weights times absorbed fraction
 //@ start
     pixel->fogged = 0.0f;
 //@ pixels_start
