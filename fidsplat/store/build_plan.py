@@ -64,7 +64,7 @@ class BuildPlan:
     origin: np.ndarray
     grid: Grid
     splitters: np.ndarray
-    """(buckets - 1,) uint64: first code of each bucket except the first"""
+    """(b,) uint64: first Morton code of each bucket of ungrouped splats, except the first bucket"""
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

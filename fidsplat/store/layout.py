@@ -299,5 +299,5 @@ def _contradiction(nodes: np.ndarray, header: Header) -> str:
         return "sizes must be at least 0, and 0 for chunks"
     corners = [nodes[name] for name in ("far_low", "low", "high", "far_high")]
     if any((a > b).any() for a, b in pairwise(corners)):
-        return "a box must lie within the larger one of its node"
+        return "a box must be within the larger box of its node"
     return ""

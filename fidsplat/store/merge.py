@@ -1,9 +1,10 @@
 """Merging splats for levels of detail.
 
-The splats of a cell whose normals have the same main axis are merged into one disk by moment matching,
-weighted by opacity times area: the disk has their mean, their covariance without its smallest axis, their
-mean colour, and an opacity that preserves opacity times area. Where cells are smaller than pixels, the merged
-splat covers the same fraction of a pixel. fidsplat/accuracy/detail_errors.py measures the error.
+The splats of a cell whose normals have the same main axis are merged into one by moment matching, weighted by
+opacity times area: a disk with their mean, their covariance without its smallest axis, their mean colour, and
+an opacity that preserves opacity times area. If one of them is a 3D Gaussian, the merged splat is one too.
+Where cells are smaller than pixels, the merged splat covers the same fraction of a pixel.
+fidsplat/accuracy/detail_errors.py measures the error.
 
 The opacity can exceed 1, as the low-pass filter reduces the alpha of splats smaller than a pixel. A cell with
 an edge between bright and dark splats becomes two splats; a single one would shift the edge by up to an
@@ -58,10 +59,10 @@ def _split_edges(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
     different keys for the bright and the dark splats of such a cell."""
     colors = splats["colors"] if "colors" in splats else C0 * splats["sh"][:, 0]
     order, starts = _runs(keys)
-    light = colors.astype(np.float64).mean(axis=1)[order]
+    brightness = colors.astype(np.float64).mean(axis=1)[order]
     lengths = np.diff(np.append(starts, len(keys)))
-    mean = np.add.reduceat(light, starts) / lengths
-    difference = light - np.repeat(mean, lengths)
+    mean = np.add.reduceat(brightness, starts) / lengths
+    difference = brightness - np.repeat(mean, lengths)
     edge = np.add.reduceat(difference * difference, starts) > EDGE**2 * lengths
     split = np.empty(len(keys), np.int64)
     split[order] = np.repeat(2 * np.arange(len(starts)), lengths) + (
@@ -112,8 +113,8 @@ def _merge_moments(
     third = np.zeros(count) if thickness is None else thickness.astype(np.float64)
     # approximate area of a 3D Gaussian, averaged over directions
     area = np.maximum(area, third * np.maximum(scales[0], scales[1]))
-    light = splats["opacities"] * area
-    weights = np.maximum(light, 1e-300)
+    opacity_area = splats["opacities"] * area
+    weights = np.maximum(opacity_area, 1e-300)
     total = np.add.reduceat(weights, starts)
     # relative to the first splat of the run, to avoid cancellation
     base = splats["means"][starts].astype(np.float64).T
@@ -136,7 +137,7 @@ def _merge_moments(
     sigma = np.sqrt(np.maximum(sizes[:, ::-1], 1e-24))
     rotations = vectors[:, :, ::-1].copy()
     rotations[:, :, 2] = np.cross(rotations[:, :, 0], rotations[:, :, 1])
-    opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
+    opacities = np.add.reduceat(opacity_area, starts) / (sigma[:, 0] * sigma[:, 1])
     copies = np.maximum(np.ceil(opacities / MAX_OPACITY), 1).astype(np.int64)
     combined = {
         "means": (base + middle).T,

@@ -154,7 +154,7 @@ class Store(Summarised):
 
     @property
     def identity(self) -> str:
-        """Hexadecimal digest of the store's content."""
+        """Hexadecimal digest of the content; for an instanced store followed by the bytes of its poses."""
         poses = "" if self.poses is None else self.poses.tobytes().hex()
         return self.header.identity + poses
 

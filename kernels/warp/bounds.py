@@ -81,8 +81,8 @@ def window_tile(corner: int, bit: int, view: View) -> int:
 
 @cache
 def make_bounds(has_lowpass_disc: bool) -> SimpleNamespace:
-    """Make functions that return the rows, columns and tiles that bounds overlap, with or without the low-pass
-    disc."""
+    """Make functions that return the rows, columns and tiles that bounds overlap, with or without the
+    low-pass disc."""
 
     @wp.func
     def rows(b: Bounds, height: int):
