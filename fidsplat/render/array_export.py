@@ -56,9 +56,10 @@ class ImageMapping(Mapping[str, np.ndarray]):
         return len(self.outputs)
 
     def device_array(self, name: str) -> Any:
-        """The image on its device, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3),
-        of a batch (views, h, w) or (views, h, w, 3); on an OpenCL device a pyopencl.array.Array, of batches
-        only.
+        """The image on its device, without a copy.
+
+        Warp: a wp.array, (h, w) or (h, w, 3); for a batch (views, h, w) or (views, h, w, 3). OpenCL: a
+        pyopencl.array.Array, for batches only; a frame raises InputError.
 
         The array belongs to this frame or batch; later frames do not overwrite it. `wp.to_torch`, DLPack and
         `__cuda_array_interface__` convert it to a tensor on the same device.

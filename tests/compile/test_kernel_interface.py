@@ -94,7 +94,7 @@ def test_kernels_have_the_declared_arguments(renderer, shape):
             )
             for k in range(kernel.num_args)
         ]
-        scalars = {"real": source.scalars.real, "wide": source.scalars.wide}
+        scalars = {"real": source.scalars.real, "blend_real": source.scalars.blend_real}
         declared = [
             (scalars.get(one.ctype, one.ctype) + ("*" if one.access else ""), one.name, bool(one.access))
             for one in source.arguments[name].values()
