@@ -264,7 +264,7 @@ class GradientPipeline(ABC):
         waits: whether to wait until the number of (splat, tile) pairs shows that the buffers were large
         enough. If not, `backward` may raise CapacityExceeded, and the frame must be discarded. Raises
         DeviceError if the frame does not fit the memory budget in one piece, as a frame that is rendered in
-        bands of tiles or projected in slices has no gradient.
+        ranges of tiles or projected in slices has no gradient.
         """
 
     @abstractmethod

@@ -83,7 +83,7 @@ class View:
     """(label, view of its splats), for moving groups of splats"""
     sub_frames: tuple[SubFrame, ...] = ()
     """sub-frames of an exposure; empty for a single pose"""
-    band: tuple[int, int] | None = None
+    sample_rows: tuple[int, int] | None = None
     """rows of samples [first, end) to render, bit-identical to those of the complete frame; None: all"""
     device_record: Any = None
     """uniforms of the projection in device memory (`opencl.buffers.DeviceRecord`), used instead of those of

@@ -61,7 +61,7 @@ class Renderer:
             or a GPU's name), "warp:cpu", "warp:cuda" (NVIDIA Warp), "reference" (NumPy, float64, slow), or
             "auto" ("opencl", else "warp" with a warning). None: the variable FIDSPLAT_DEVICE, else "auto".
         memory_budget: bytes of device memory for a frame and its cloud; by default nine tenths of the
-            device's memory. Tile lists that exceed it are split into bands of tiles. OpenCL also projects
+            device's memory. Tile lists that exceed it are split into ranges of tiles. OpenCL also projects
             larger clouds in slices, and renders in bands of rows; a larger cloud is an error on Warp.
             Smaller budgets are slower, with bit-identical images.
 
@@ -451,7 +451,7 @@ def _images_of(pipeline: Pipeline, data: Any, view: View, subsampling: Subsampli
 
 def _restricted(view: View, band: tuple[int, int]) -> View:
     """The view restricted to rows of pixels [first, end)."""
-    return replace(view, band=(band[0] * view.samples, band[1] * view.samples))
+    return replace(view, sample_rows=(band[0] * view.samples, band[1] * view.samples))
 
 
 def _capture_of(scene: Any, capture: Capture | Camera | None, **fields: Any) -> Capture:

@@ -150,7 +150,7 @@ def e2(renderer: Renderer) -> Found:
     "list lengths that add up to 2^31 - 1 .. 5 * 2^32 + 17; budgets from one pair upwards",
 )
 def e3(renderer: Renderer) -> Found:
-    # sums beyond 32 bits, and a frame that is rendered in bands of tiles
+    # sums beyond 32 bits, and a frame that is rendered in ranges of tiles
     backend = renderer.backend
     if not backend.has("probe"):
         return

@@ -58,7 +58,7 @@ class Band:
 
     @staticmethod
     def of(scene: ChunkedSplats, view: View, features: FeatureSet, cell_sizes: CellSizes) -> Band:
-        first, end = view.band or (0, view.height)
+        first, end = view.sample_rows or (0, view.height)
         return Band(scene, view, features, cell_sizes, (first // view.samples, end // view.samples))
 
     def with_rows(self, first: int, end: int) -> Band:
@@ -120,7 +120,7 @@ class Band:
         first, end = (row * self.full_view.samples for row in self.rows)
         if (first, end) == (0, self.full_view.height):
             return self.full_view
-        return replace(self.full_view, band=(first, end))
+        return replace(self.full_view, sample_rows=(first, end))
 
     @cached_property
     def visible(self) -> NodeMasks:

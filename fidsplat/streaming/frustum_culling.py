@@ -219,7 +219,7 @@ class CameraBoxes:
 def _pinhole_sides(view: View, margin: float) -> list[tuple[np.ndarray, float]]:
     """Half spaces normal . p + offset >= 0 of the frustum's sides, widened by `margin` samples."""
     sides = []
-    rows = (0, view.height) if view.band is None else view.band
+    rows = (0, view.height) if view.sample_rows is None else view.sample_rows
     grid = ((0, view.focal_x, view.center_x, (0, view.width)), (1, view.focal_y, view.center_y, rows))
     for axis, focal, center, (first, end) in grid:
         for sign, border in ((1.0, first - margin), (-1.0, end + margin)):

@@ -93,7 +93,7 @@ def _tile_spans(
 ) -> tuple[np.ndarray, ...]:
     """Rows [top, bottom) and columns [left, right) of the tiles that boxes can touch, (n,) int64 each."""
     columns = termination.depths.shape[1]
-    first, end = (0, view.height) if view.band is None else view.band
+    first, end = (0, view.height) if view.sample_rows is None else view.sample_rows
     tile_rows = first // termination.tile[0], -(-end // termination.tile[0])
     if view.raster is not None:
         return tuple(np.full(len(max_sigma), border, np.int64) for border in (*tile_rows, 0, columns))

@@ -23,7 +23,7 @@ static inline SortBlock sort_block_of(uint length, int width, int height, global
     return c;
 }
 
-typedef struct {             // state of bin_emit: tiles [first, end) of the band; base: start of its first list
+typedef struct {             // state of bin_emit: tiles [first, end); base: start of its first list
     int first, end;
     uint base;
     global const uint *starts;
@@ -34,7 +34,7 @@ typedef struct {             // state of bin_emit: tiles [first, end) of the ban
 static inline void bin_tile(int tile, uint index, const SortBlock *c, const Emission *e) {
     if (e) {
         if (tile < e->first || tile >= e->end) return;
-        // differences modulo 2^32 are correct within the band, even if the frame has more pairs
+        // differences modulo 2^32 are correct within the range of tiles, even if the frame has more pairs
         uint position = e->starts[tile] - e->base + c->row[tile];
         e->lists[position] = index;
     }
@@ -72,7 +72,7 @@ kernel void bin_count(
     bin_splats(order, windows, big_capacity, big_bounds, &c, 0);
 }
 
-// Reads: the inputs of bin_count, and starts. Reads and overwrites: table, of the tiles in the band. Writes: lists.
+// Reads: the inputs of bin_count, and starts. Reads and overwrites: table, of the tiles [first_tile, end_tile). Writes: lists.
 kernel void bin_emit(
 //@@ arguments bin_emit
 ) {
@@ -80,6 +80,6 @@ kernel void bin_emit(
     const SortBlock c = sort_block_of(counters[get_global_id(1) * COUNTERS + COUNTER_VISIBLE], width, height, table);
     order += get_global_id(1) * count;
     int before = (int)get_global_id(1) * c.tiles_x * c.tiles_y;    // tiles of preceding views
-    const Emission e = {band_first - before, band_end - before, starts[band_first], starts + before, lists};
+    const Emission e = {first_tile - before, end_tile - before, starts[first_tile], starts + before, lists};
     bin_splats(order, windows, big_capacity, big_bounds, &c, &e);
 }

@@ -150,7 +150,7 @@ kernel void project(
     int first = pixel_above(x0 - 0.5f, width), last = pixel_below(x1 - 0.5f, width);
     if (!(y0 < y1 && x0 <= x1 && first < width && last >= 0 && first <= last)) return;
 
-    if (y1 <= (int)view->band || y0 >= (int)view->band_end) {
+    if (y1 <= (int)view->first_row || y0 >= (int)view->end_row) {
         KEY = OUT_OF_BAND;
         return;
     }

@@ -131,16 +131,16 @@ static inline int rect_tile(const TileRect *rect, int k, const Bounds *b, int wi
 #define TEAM_TILES (8 * TEAM)   // the complete work-group lists a splat whose rectangle has more tiles
 #define TEAM_DEFERRED 16        // maximum number of such splats of a team, which lists further ones itself
 
-// Lists of the tiles of a band [band_first, band_end), at most `capacity` pairs.
+// Lists of the tiles [first_tile, end_tile), at most `capacity` pairs.
 typedef struct {
     int tiles_x, first, end;
     uint start, capacity;
-} Band;
+} TileRange;
 
-// Next free index of a tile's list, or NO_OFFSET outside of the band. Modulo 2^32: indices within the band are right even if the
+// Next free index of a tile's list, or NO_OFFSET outside of the range. Modulo 2^32: indices within the range are right even if the
 // frame has more pairs than that.
-static inline uint next_offset(int tile, const Band *band, global uint *restrict cursors, bool shared) {
-    return tile < band->first || tile >= band->end ? NO_OFFSET : INCREMENT(cursors, tile, shared) - band->start;
+static inline uint next_offset(int tile, const TileRange *tile_range, global uint *restrict cursors, bool shared) {
+    return tile < tile_range->first || tile >= tile_range->end ? NO_OFFSET : INCREMENT(cursors, tile, shared) - tile_range->start;
 }
 
 typedef struct {
@@ -152,16 +152,16 @@ typedef struct {
 //@@ big_records
 } BigSplats;
 
-// Advances the cursors of all tiles that a big splat overlaps, and writes its pairs where the band has capacity for them.
+// Advances the cursors of all tiles that a big splat overlaps, and writes its pairs where the range has capacity for them.
 // `items` work-items share the tiles of the rectangle; this one is number `item`.
 static inline void list_big_splat(const BigSplats *splats, uint k, const TileRect *rect, const Bounds *b, int item, int items,
-                                  const Band *band, global uint *restrict cursors, global uint2 *restrict pairs) {
+                                  const TileRange *tile_range, global uint *restrict cursors, global uint2 *restrict pairs) {
     uint splat = splats->big[k];
     int before = (int)(splat / splats->count) * tiles_of(splats->width, splats->height);
     for (int n = item; n < rect->tiles; n += items) {
         int tile = rect_tile(rect, n, b, splats->width, splats->height);
-        uint position = tile < 0 ? NO_OFFSET : next_offset(before + tile, band, cursors, false);
-        if (position >= band->capacity) continue;
+        uint position = tile < 0 ? NO_OFFSET : next_offset(before + tile, tile_range, cursors, false);
+        if (position >= tile_range->capacity) continue;
         uint key = splats->keys[splat];
 //@@ big_key
         pairs[position] = (uint2)(splat, key);
@@ -170,7 +170,7 @@ static inline void list_big_splat(const BigSplats *splats, uint k, const TileRec
 
 // Lists every `groups`-th of the first `big_count` big splats, by a complete work-group: a team for each splat, then all teams for
 // each splat of very many tiles. deferred: scratch.
-static inline void list_big_splats(const BigSplats *splats, uint group, uint groups, uint big_count, const Band *band,
+static inline void list_big_splats(const BigSplats *splats, uint group, uint groups, uint big_count, const TileRange *tile_range,
                                    global uint *restrict cursors, global uint2 *restrict pairs, local uint (*deferred)[TEAM_DEFERRED + 1]) {
     uint item = get_local_id(0), team = item / TEAM, deferred_count = 0;
     for (uint k = group * TEAMS + team; k < big_count; k += groups * TEAMS) {
@@ -179,7 +179,7 @@ static inline void list_big_splats(const BigSplats *splats, uint group, uint gro
         if (rect.tiles > TEAM_TILES && deferred_count < TEAM_DEFERRED) {
             deferred_count++;
             if (item % TEAM == 0) deferred[team][deferred_count] = k;
-        } else list_big_splat(splats, k, &rect, &b, item % TEAM, TEAM, band, cursors, pairs);
+        } else list_big_splat(splats, k, &rect, &b, item % TEAM, TEAM, tile_range, cursors, pairs);
     }
     if (item % TEAM == 0) deferred[team][0] = deferred_count;
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -187,7 +187,7 @@ static inline void list_big_splats(const BigSplats *splats, uint group, uint gro
         for (uint n = 1; n <= deferred[team][0]; n++) {
             const Bounds b = splats->bounds[deferred[team][n]];
             const TileRect rect = tile_rect(&b, splats->width, splats->height);
-            list_big_splat(splats, deferred[team][n], &rect, &b, item, BIN_ITEMS, band, cursors, pairs);
+            list_big_splat(splats, deferred[team][n], &rect, &b, item, BIN_ITEMS, tile_range, cursors, pairs);
         }
 }
 
@@ -199,14 +199,14 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void count_big(
 ) {
     local uint deferred[TEAMS][TEAM_DEFERRED + 1];
     const BigSplats shared = {count, width, height, big, big_bounds};
-    const Band no_pairs = {0, 0, INT_MAX, 0, 0};
+    const TileRange no_pairs = {0, 0, INT_MAX, 0, 0};
     list_big_splats(&shared, get_group_id(0), get_num_groups(0), min(counters[COUNTER_BIG], big_capacity), &no_pairs, counters + COUNTERS, 0, deferred);
 }
 
-// Writes the (splat, key) pairs of all tiles of a band.
+// Writes the (splat, key) pairs of all tiles of a range.
 // Index space: for each view the same number of work-groups, which share the big splats, then `splat_groups` work-groups, one
 // work-item per splat.
-// Reads: windows, keys, starts, big, big_bounds. Reads and overwrites: cursors of the band. Writes: pairs; adds to
+// Reads: windows, keys, starts, big, big_bounds. Reads and overwrites: cursors of the range. Writes: pairs; adds to
 // counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
@@ -214,7 +214,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     local uint queued;          // length of the queue, and number of visible splats
     local ushort queue[BIN_ITEMS * WINDOW_TILES];     // (work-item of the splat, tile of its window)
     local uint corners[BIN_ITEMS], depths[BIN_ITEMS], deferred[TEAMS][TEAM_DEFERRED + 1];
-    const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
+    const TileRange tile_range = {(width + TILE_W - 1) / TILE_W, first_tile, end_tile, starts[first_tile], capacity};
     uint item = get_local_id(0), view_index = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
     if (item == 0) queued = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -223,7 +223,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
         const BigSplats shared = {count, width, height, big, big_bounds, keys
 //@@ big_record_arguments
         };
-        list_big_splats(&shared, view_index * groups + get_group_id(0), groups * get_num_groups(1), big_count, &band, cursors,
+        list_big_splats(&shared, view_index * groups + get_group_id(0), groups * get_num_groups(1), big_count, &tile_range, cursors,
                         pairs, deferred);
     } else {
         uint splat = view_index * count + i;
@@ -247,19 +247,19 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
             owners[n] = entry / WINDOW_TILES;
             positions[n] = NO_OFFSET;
             if (entry != NO_ENTRY) {
-                int tile = before + window_tile((uint2)(corners[owners[n]], 1u << entry % WINDOW_TILES), band.tiles_x);
+                int tile = before + window_tile((uint2)(corners[owners[n]], 1u << entry % WINDOW_TILES), tile_range.tiles_x);
                 if (n == 0) shared = SHARES(tile);
-                positions[n] = next_offset(tile, &band, cursors, shared);
+                positions[n] = next_offset(tile, &tile_range, cursors, shared);
             }
         }
         for (uint n = 0; n < UNROLL; n++)
-            if (positions[n] < band.capacity) pairs[positions[n]] = (uint2)(first_splat + owners[n], depths[owners[n]]);
+            if (positions[n] < tile_range.capacity) pairs[positions[n]] = (uint2)(first_splat + owners[n], depths[owners[n]]);
     }
-    if (item == 0 && first_band && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
+    if (item == 0 && counts_visible && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
 
 // Sorts each tile's list by (depth key, splat); all keys differ.
-// Index space: work-groups of SORT_ITEMS, one per tile of the band.
+// Index space: work-groups of SORT_ITEMS, one per tile of the range.
 // Reads: starts. Reads and overwrites: pairs. Writes: lists; counters, zeroed for the next frame if `clear`.
 //
 // A list is bucket-sorted by depth if its pairs, or their indices within the list, fit local memory. Longer and short lists, and those
@@ -414,8 +414,8 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
 ) {
     local ulong items[SORT_LOCAL];
     local Buckets buckets;
-    uint tile = band_first + get_group_id(0), item = get_local_id(0);
-    uint start = starts[tile] - starts[band_first], length = starts[tile + 1] - starts[tile];
+    uint tile = first_tile + get_group_id(0), item = get_local_id(0);
+    uint start = starts[tile] - starts[first_tile], length = starts[tile + 1] - starts[tile];
     global ulong *list = pairs + start;
     if (clear && item == 0) {
         counters[COUNTERS + tile] = 0;

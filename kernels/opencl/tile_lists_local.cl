@@ -87,7 +87,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void count_local(
 }
 
 // Index space: as count_local.
-// Reads: windows, keys, starts. Reads and overwrites: cursors of the band. Writes: pairs; adds to counts[COUNT_VISIBLE].
+// Reads: windows, keys, starts. Reads and overwrites: cursors of the range. Writes: pairs; adds to counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
 //@@ arguments emit_local
 ) {
@@ -96,7 +96,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
     local int extents[4];
     const SplatRange range = splat_range_of(count);
     int tiles = tiles_of(width, height), tiles_x = (width + TILE_W - 1) / TILE_W, before = (int)get_group_id(1) * tiles;
-    const Band band = {tiles_x, band_first, band_end, starts[band_first], capacity};
+    const TileRange tile_range = {tiles_x, first_tile, end_tile, starts[first_tile], capacity};
     if (get_local_id(0) == 0) visible = 0;
     const Area area = area_of(&range, tiles, tiles_x, windows, keys, extents);
     bool counted = area.tiles <= LOCAL_TILES;
@@ -105,7 +105,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
         for (int position = get_local_id(0); position < area.tiles; position += SCAN_ITEMS) {
             if (pair_counts[position] == 0) continue;
             int tile = before + area_tile(&area, position, tiles_x);
-            if (tile >= band.first && tile < band.end) pair_counts[position] = atomic_add(cursors + tile, pair_counts[position]);
+            if (tile >= tile_range.first && tile < tile_range.end) pair_counts[position] = atomic_add(cursors + tile, pair_counts[position]);
         }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -113,13 +113,13 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
     for (uint splat = range.first + get_local_id(0); splat < range.end; splat += SCAN_ITEMS) {
         uint key = keys[splat];
         if (key == CULLED) continue;
-        if (first_band) visible_here++;
+        if (counts_visible) visible_here++;
         for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) {
             int tile = before + window_tile(window, tiles_x);
-            if (tile < band.first || tile >= band.end) continue;
+            if (tile < tile_range.first || tile >= tile_range.end) continue;
             // modulo 2^32, see next_offset
-            uint position = counted ? atomic_inc(pair_counts + area_index(&area, window)) - band.start : next_offset(tile, &band, cursors, false);
-            if (position < band.capacity) pairs[position] = (uint2)(splat, key);
+            uint position = counted ? atomic_inc(pair_counts + area_index(&area, window)) - tile_range.start : next_offset(tile, &tile_range, cursors, false);
+            if (position < tile_range.capacity) pairs[position] = (uint2)(splat, key);
         }
     }
     if (visible_here != 0) atomic_add(&visible, visible_here);

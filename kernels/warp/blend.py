@@ -162,8 +162,8 @@ def make_blend(
 
     @wp.kernel(name=f"blend_gpu_{words}", launch_bounds=launched, **options)
     def blend_gpu(
-        band_first: int,
-        tile_order: wp.array(dtype=wp.int32),  # tile of block 0 at band_first
+        first_tile: int,
+        tile_order: wp.array(dtype=wp.int32),  # tile of block 0 at first_tile
         views: wp.array(dtype=View),
         rays: Rays,
         records: wp.array(dtype=wp.vec4),
@@ -173,7 +173,7 @@ def make_blend(
         samples: Samples,  # out
     ):
         thread = wp.tid()
-        tile = tile_order[band_first + thread / threads]
+        tile = tile_order[first_tile + thread / threads]
         item = thread % threads
         number, tile_column, tile_row = locate_tile(tile, views)
         view = views[reread(number)]
@@ -277,7 +277,7 @@ def make_blend(
 
     @wp.kernel(name=f"blend_cpu_{words}", **options)
     def blend_cpu(
-        band_first: int,  # tile of thread 0
+        first_tile: int,  # tile of thread 0
         views: wp.array(dtype=View),
         rays: Rays,
         records: wp.array(dtype=wp.vec4),
@@ -289,7 +289,7 @@ def make_blend(
         state: wp.array(dtype=Pixel),  # samples of one tile from `state_first` on; scratch
         state_first: int,
     ):
-        tile = band_first + wp.tid()
+        tile = first_tile + wp.tid()
         number, tile_column, tile_row = locate_tile(tile, views)
         view = views[number]
         x0 = tile_column * view.tile_w

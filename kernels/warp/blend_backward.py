@@ -200,7 +200,7 @@ def make_blend_backward(
 
     @wp.kernel(launch_bounds=threads, **options)
     def blend_backward_gpu(
-        band_first: int,  # tile of block 0
+        first_tile: int,  # tile of block 0
         views: wp.array(dtype=View),  # (1)
         background: wp.vec3,
         log_ceiling: float,
@@ -217,7 +217,7 @@ def make_blend_backward(
     ):
         view = views[0]
         thread = wp.tid()
-        tile = band_first + thread / threads
+        tile = first_tile + thread / threads
         item = thread % threads
         block, lane = item / 32, item % 32
         across = view.tile_w / BLOCK_W
@@ -321,7 +321,7 @@ def make_blend_backward(
 
     @wp.kernel(**options)
     def blend_backward_cpu(
-        band_first: int,  # tile of thread 0
+        first_tile: int,  # tile of thread 0
         views: wp.array(dtype=View),  # (1)
         background: wp.vec3,
         log_ceiling: float,
@@ -341,7 +341,7 @@ def make_blend_backward(
         state_first: int,
     ):
         view = views[0]
-        tile = band_first + wp.tid()
+        tile = first_tile + wp.tid()
         x0 = (tile % view.tiles_x) * view.tile_w
         y0 = (tile / view.tiles_x) * view.tile_h
         area = view.tile_w * view.tile_h

@@ -387,16 +387,16 @@ def sort_list(pairs: wp.array(dtype=wp.uint64), lists: wp.array(dtype=wp.int32),
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=START_BLOCK)
 def start_lists(
-    band_first: int,
+    first_tile: int,
     counters: wp.array(dtype=wp.int32),
-    band_end: int,
+    end_tile: int,
     capacity: int,  # all lists are empty if there are more pairs
-    totals: wp.array(dtype=wp.int64),  # (2) out: visible splats, pairs of the band
+    totals: wp.array(dtype=wp.int64),  # (2) out: visible splats, pairs of the range
     cursors: wp.array(dtype=wp.int32),  # (tiles) out: next position in each tile's list
     starts: wp.array(dtype=wp.int32),  # (tiles + 1) out: start of each tile's list
-    tile_order: wp.array(dtype=wp.int32),  # (tiles) out: tiles of the band
+    tile_order: wp.array(dtype=wp.int32),  # (tiles) out: tiles of the range
 ):
-    start(counters, band_first, band_end, capacity, totals, cursors, starts, tile_order)
+    start(counters, first_tile, end_tile, capacity, totals, cursors, starts, tile_order)
 
 
 @wp.func
@@ -405,15 +405,15 @@ def list_pair(
     key: wp.uint32,
     index: int,
     shared: bool,
-    band_first: int,
-    band_end: int,
+    first_tile: int,
+    end_tile: int,
     cursors: wp.array(dtype=wp.int32),
     first_cursor: int,
     capacity: int,
     pairs: wp.array(dtype=wp.uint64),
 ):
-    """Advance the cursor of a tile of the band, and write the pair if there is capacity for it."""
-    if tile >= band_first and tile < band_end:
+    """Advance the cursor of a tile of the range, and write the pair if there is capacity for it."""
+    if tile >= first_tile and tile < end_tile:
         position = increment(cursors, first_cursor + tile, shared)
         if position >= 0 and position < capacity:
             pairs[position] = (wp.uint64(key) << HIGH) | wp.uint64(index)
@@ -424,8 +424,8 @@ def list_windows(
     first: int,
     splats: int,
     views: wp.array(dtype=View),
-    band_first: int,
-    band_end: int,
+    first_tile: int,
+    end_tile: int,
     keys: wp.array(dtype=wp.uint32),
     windows: wp.array(dtype=wp.uint64),
     cursors: wp.array(dtype=wp.int32),
@@ -451,18 +451,18 @@ def list_windows(
         tile = window_tile(corner, nth_bit(bits, entry - first_entry(entries, owner)), view)
         if entry < step:
             shared = threads_share_tile(tile)
-        list_pair(tile, keys[index], index, shared, band_first, band_end, cursors, 0, capacity, pairs)
+        list_pair(tile, keys[index], index, shared, first_tile, end_tile, cursors, 0, capacity, pairs)
         entry += step
 
 
 @wp.kernel(enable_backward=False)
 def sort_lists(
-    band_first: int,  # tile of block 0
+    first_tile: int,  # tile of block 0
     starts: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.uint64),  # sorted in any order
     lists: wp.array(dtype=wp.int32),  # out: splats of each tile in depth order
 ):
-    tile = band_first + wp.tid() / wp.block_dim()
+    tile = first_tile + wp.tid() / wp.block_dim()
     sort_list(pairs, lists, starts[tile], starts[tile + 1] - starts[tile])
 
 
@@ -486,7 +486,7 @@ def nth_bit(bits: wp.uint32, n: int) -> int:
 
 
 @wp.func
-def first_tile(index: int, view: View) -> int:
+def corner_tile(index: int, view: View) -> int:
     """First tile of a splat's view."""
     return index / view.splats * (view.tiles_x * view.tiles_y)
 
@@ -522,8 +522,8 @@ def make_list_big(has_lowpass_disc: bool):
         first: int,  # number of block 0
         blocks: int,  # of all launches
         views: wp.array(dtype=View),
-        band_first: int,
-        band_end: int,
+        first_tile: int,
+        end_tile: int,
         counters: wp.array(dtype=wp.int32),
         big: wp.array(dtype=wp.int32),
         keys: wp.array(dtype=wp.uint32),
@@ -559,10 +559,10 @@ def make_list_big(has_lowpass_disc: bool):
                 row, column = top + cell / columns, left + cell % columns
                 begin, end = limits.tile_span(b, row, view)
                 if column >= begin and column < end:
-                    tile = first_tile(index, view) + row * view.tiles_x + column
+                    tile = corner_tile(index, view) + row * view.tiles_x + column
                     key = keys[index]
                     list_pair(
-                        tile, key, index, False, band_first, band_end, cursors, first_cursor, capacity, pairs
+                        tile, key, index, False, first_tile, end_tile, cursors, first_cursor, capacity, pairs
                     )
                 entry += step
             group += blocks * each

@@ -302,7 +302,7 @@ def test_parts_of_a_batch_are_replayed(renderer, replayed, monkeypatch):
 
 
 def test_views_together_in_blocks_of_threads(renderer):
-    """The GPU's schedule of a batch: all views at once, more than the budget in bands of tiles."""
+    """The GPU's schedule of a batch: all views at once, more than the budget in ranges of tiles."""
     backend = renderer.backend
     resident, captures = backend.upload(CLOUD), [CAPTURE.with_(camera=camera) for camera in CROSSING[:3]]
     features, views = prepare_batch(resident, capture_batch(captures, None, None, None))

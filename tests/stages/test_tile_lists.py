@@ -276,7 +276,7 @@ def test_lists_of_all_depth_distributions_are_sorted(backend, depths):
 @pytest.mark.parametrize("lists", ["sort_first", "bin_first"])
 @pytest.mark.parametrize("budget", [1, 50, 1000])
 def test_a_small_pair_budget_is_bit_identical(backend, monkeypatch, budget, lists):
-    """Case E3: a frame with more pairs than the budget is rendered in bands of tiles."""
+    """Case E3: a frame with more pairs than the budget is rendered in ranges of tiles."""
     cloud = random_splats(300, seed=12)
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS))
     # the shape of a CPU for its own strategy, which uses bands most often

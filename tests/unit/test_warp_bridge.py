@@ -207,7 +207,7 @@ def test_derivatives_that_cannot_be_taken_are_errors(renderer):
         pipeline.backward(images, {"rgb": wp.zeros((43, 61), dtype=float, device="cpu")})
     before, backend.pair_budget = backend.pair_budget, images.stats["pairs"] - 1
     try:
-        with pytest.raises(fs.DeviceError, match="must fit the memory budget without bands"):
+        with pytest.raises(fs.DeviceError, match="must fit the memory budget without ranges of tiles"):
             pipeline.forward(resident, view)
     finally:
         backend.pair_budget = before

@@ -357,7 +357,7 @@ def test_a_memory_budget_renders_in_bands_bit_identically():
     separate_renderer = fs.Renderer("warp:cpu", memory_budget=6_894_400)
     frame = separate_renderer.render(cloud, view, ALL_OUTPUTS)
     assert separate_renderer.backend.pool._arrays["lists", wp.int32].size < expected.stats["pairs"], (
-        "rendered in bands"
+        "rendered in ranges of tiles"
     )
     assert frame.stats == expected.stats
     assert all(np.array_equal(frame[name], expected[name]) for name in ALL_OUTPUTS)
@@ -376,7 +376,7 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     separate_renderer = fs.Renderer("warp:cpu", memory_budget=6_170_000)
     frame = separate_renderer.render(cloud, view, ("rgb", "depth"), **exposed)
     assert separate_renderer.backend.pool._arrays["lists", wp.int32].size < expected.stats["pairs"], (
-        "rendered in bands"
+        "rendered in ranges of tiles"
     )
     assert all(np.array_equal(frame[name], expected[name]) for name in ("rgb", "depth"))
     small = fs.Renderer("warp:cpu", memory_budget=5_500_000)

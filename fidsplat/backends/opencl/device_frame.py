@@ -129,9 +129,9 @@ class DeviceFrame:
         self.rows = self.tiles_y * config.tile_height
         self.first_tile, self.end_tile = 0, self.tiles
         """tiles of the requested rows"""
-        if view.band is not None and config.binning == "sort_first" and self.views == 1:
-            self.first_tile = view.band[0] // config.tile_height * self.tiles_x
-            self.end_tile = -(-view.band[1] // config.tile_height) * self.tiles_x
+        if view.sample_rows is not None and config.binning == "sort_first" and self.views == 1:
+            self.first_tile = view.sample_rows[0] // config.tile_height * self.tiles_x
+            self.end_tile = -(-view.sample_rows[1] // config.tile_height) * self.tiles_x
         self.buffers = FrameBuffers()
         self.named: dict[str, cl.Buffer] = vars(self.buffers)
         """all buffers, including those of effects and outputs, by the names of the kernel arguments"""
@@ -157,8 +157,8 @@ class DeviceFrame:
         """event after which the pairs are counted, if the host did not wait"""
         self.recorded: Any = None
         """the RecordedFrame that replays it, if there is one"""
-        self.in_bands = False
-        """whether the lists exceeded the pair budget, so that the frame was rendered in bands of tiles"""
+        self.in_tile_ranges = False
+        """whether the lists exceeded the pair budget, so that the frame was rendered in ranges of tiles"""
         self.pairs = 0
         """number of listed pairs; the capacity of the lists if the host did not wait"""
         self.stats: Callable[[], dict[str, int]] = dict

@@ -1,7 +1,7 @@
 """The stages of a frame in order: project, bin, sort, blend, resolve.
 
 They are submitted to one in-order queue. A frame with more pairs than the memory budget allows is binned and
-blended in bands of tiles; a frame with a shutter is blended pose by pose and resolved once. Images are
+blended in ranges of tiles; a frame with a shutter is blended pose by pose and resolved once. Images are
 bit-identical in every case.
 """
 
@@ -16,7 +16,7 @@ import pyopencl as cl
 from fidsplat.backends.opencl import tiling
 from fidsplat.backends.opencl.counts import COUNTERS, COUNTS, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame
-from fidsplat.backends.opencl.tiling import TileBand
+from fidsplat.backends.opencl.tiling import TileRange
 from fidsplat.backends.view import SubFrame
 
 _GRID = (16, 4)
@@ -48,7 +48,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
             frame.scratch(samples.name, 4 * frame.scalars["channel_stride"] * samples.channels)
     if "termination_depths" in frame.source.arguments["blend"]:
         depths = frame.acquire("termination_depths", 4 * frame.tiles)
-        if frame.view.band is not None:
+        if frame.view.sample_rows is not None:
             cl.enqueue_fill_buffer(frame.queue, depths, _NO_DEPTH, 0, 4 * frame.tiles)
 
 
@@ -65,9 +65,9 @@ def render_sort_first(frame: DeviceFrame) -> None:
             break
         big = counts.big
         frame.discard_launches()
-    for band in tiling.sorted_bands(frame, frame.first_tile, frame.end_tile, counts.pairs):
-        tiling.list_sorted(frame, band, count)
-        blend(frame, band)
+    for tile_range in tiling.sorted_tile_ranges(frame, frame.first_tile, frame.end_tile, counts.pairs):
+        tiling.list_sorted(frame, tile_range, count)
+        blend(frame, tile_range)
     resolve(frame)
     frame.pairs, frame.stats = counts.pairs, partial(counts.stats, count)
 
@@ -84,8 +84,8 @@ def render_bin_first(frame: DeviceFrame) -> None:
     counted = tiling.start_lists(frame, capacity)
     frame.launches_until_counts = len(frame.events)
     if capacity:
-        all_tiles = TileBand(0, frame.tiles, capacity)
-        tiling.list_and_sort(frame, all_tiles, capacity, first_band=True)
+        all_tiles = TileRange(0, frame.tiles, capacity)
+        tiling.list_and_sort(frame, all_tiles, capacity, counts_visible=True)
         blend(frame, all_tiles)
         resolve(frame)
     if frame.waits:
@@ -108,12 +108,12 @@ def complete_bin_first(frame: DeviceFrame, counted: cl.Event, capacity: int) -> 
     if capacity and counts.pairs <= capacity:
         return
     tiling.start_lists(frame, _UNLIMITED)
-    bands = tiling.unsorted_bands(frame, counts.pairs)
+    tile_ranges = tiling.unsorted_tile_ranges(frame, counts.pairs)
     with_margin = min(counts.pairs * 5 // 4, frame.workspace.pair_budget)
-    capacity = max(with_margin, *(band.pairs for band in bands))
-    for band in bands:
-        tiling.list_and_sort(frame, band, capacity, first_band=band is bands[0])
-        blend(frame, band)
+    capacity = max(with_margin, *(tile_range.pairs for tile_range in tile_ranges))
+    for tile_range in tile_ranges:
+        tiling.list_and_sort(frame, tile_range, capacity, counts_visible=tile_range is tile_ranges[0])
+        blend(frame, tile_range)
     resolve(frame)
 
 
@@ -132,24 +132,24 @@ def render_in_slices(frame: DeviceFrame) -> None:
         tiling.count_pairs(frame, packed.count)
         first, last = top * frame.tiles_x, end * frame.tiles_x
         listed = int(tiling.tile_pairs(frame)[first:last].sum(dtype=np.int64))
-        for band in tiling.sorted_bands(frame, first, last, listed):
-            tiling.list_sorted(frame, band, packed.count)
-            blend(frame, band)
+        for tile_range in tiling.sorted_tile_ranges(frame, first, last, listed):
+            tiling.list_sorted(frame, tile_range, packed.count)
+            blend(frame, tile_range)
         visible, pairs = max(visible, packed.visible), pairs + listed
     resolve(frame)
     frame.stats = partial(dict, splats=frame.resident.count, visible=visible, pairs=pairs)
 
 
-def blend(frame: DeviceFrame, band: TileBand) -> None:
-    """Submit the blend kernel for a band of tiles; GPUs start with the longest lists."""
+def blend(frame: DeviceFrame, tile_range: TileRange) -> None:
+    """Submit the blend kernel for a range of tiles; GPUs start with the longest lists."""
     group = frame.config.blend_items
-    arguments: dict[str, Any] = {"band_first": band.first}
+    arguments: dict[str, Any] = {"first_tile": tile_range.first}
     if frame.config.schedule == "group":
-        ordered = frame.config.binning != "sort_first" and band.end - band.first == frame.tiles
+        ordered = frame.config.binning != "sort_first" and tile_range.end - tile_range.first == frame.tiles
         # without an order the kernel does not read it, but an argument must be a buffer
         arguments["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
         arguments["longest_first"] = ordered
-    frame.launch("blend", "blend", ((band.end - band.first) * group,), (group,), **arguments)
+    frame.launch("blend", "blend", ((tile_range.end - tile_range.first) * group,), (group,), **arguments)
 
 
 def resolve(frame: DeviceFrame) -> None:

@@ -24,7 +24,7 @@ VIEW = Record(
         member("real log_alpha_cutoff", "ln(alpha cut-off)"),
         member("real width height", "of the sample grid"),
         member("real sample_area", "area of a sample [pixels^2], for low-pass filters defined in pixels"),
-        member("real band band_end", "rows of samples to render"),
+        member("real first_row end_row", "rows of samples to render"),
     ),
 )
 """Uniforms of the projection: one record for each view, then one for each view and moving group."""
@@ -111,7 +111,7 @@ _BLENDED = args(
 
 _BLEND = args(
     *("in Splat splats", "in uint lists starts"),
-    "uint band_first  // the first tile of this launch; lists begin with its list",
+    "uint first_tile  // the first tile of this launch; lists begin with its list",
     *(_SIZE, "blend_real log_alpha_cutoff opacity_ceiling transmittance_stop sample_area"),
     "uint channel_stride  // samples per channel of raw, of all views",
     "out float raw  // 4 channels: r, g, b, transmittance",
@@ -174,7 +174,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("out uint table", "in uint starts", "out uint keys_out indices_out"),
     ),
     "bin_count": _BIN_ARGUMENTS,
-    "bin_emit": args(*(_BIN_ARGUMENTS, "in uint starts", "int band_first band_end", "out uint lists")),
+    "bin_emit": args(*(_BIN_ARGUMENTS, "in uint starts", "int first_tile end_tile", "out uint lists")),
     "tile_starts": args(
         "uint tiles capacity", "in uint counters", "out uint starts cursors counts tile_order"
     ),
@@ -183,9 +183,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *(
             "uint count",
             "uint splat_groups  // work-groups with one work-item per splat, after those of the big splats",
-            "uint first_band  // whether to add the visible splats to counts",
+            "uint counts_visible  // whether to add the visible splats to counts",
             _SIZE,
-            "int band_first band_end",
+            "int first_tile end_tile",
             "uint capacity big_capacity",
         ),
         *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
@@ -194,12 +194,12 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "count_local": args("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint counters"),
     "emit_local": args(
         "uint count",
-        "uint first_band  // whether to add the visible splats to counts",
-        *(_SIZE, "int band_first band_end", "uint capacity"),
+        "uint counts_visible  // whether to add the visible splats to counts",
+        *(_SIZE, "int first_tile end_tile", "uint capacity"),
         *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
     ),
     "sort_tiles": args(
-        "int band_first",
+        "int first_tile",
         "uint clear  // whether to zero the counters for the next frame",
         *("in uint starts", "out ulong pairs", "out uint lists counters"),
     ),

@@ -1,7 +1,7 @@
 """The memory plan: how a frame or batch is divided to fit the memory budget.
 
 A frame is rendered in one piece if its buffers fit. If only its (splat, tile) pairs exceed the budget, it is
-binned and blended in bands of tiles. As the last resort the cloud is projected in slices (ranges of
+binned and blended in ranges of tiles. As the last resort the cloud is projected in slices (ranges of
 consecutive splats), of which only visible splats are stored. A batch is rendered in parts of as many views as
 fit.
 """

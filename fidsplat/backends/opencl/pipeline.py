@@ -84,7 +84,7 @@ class OpenCLPipeline(Pipeline):
             return self._unvectorised.render_view(resident, view)
         with self.workspace.rendering():
             key = self._key(view)
-            cached = resident.cached_frames.get(key) if view.band is None else None
+            cached = resident.cached_frames.get(key) if view.sample_rows is None else None
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
             if resident.is_spatially_sorted and self.config.binning == "bin_first":
@@ -97,7 +97,7 @@ class OpenCLPipeline(Pipeline):
                 # frames in slices use only this strategy; it is the fastest with little memory
                 return self._with_binning("sort_first").render_view(resident, view)
             frame = self._render_planned(resident, view, plan)
-            complete = not (plan.slice_size or frame.in_bands or view.sub_frames or view.band)
+            complete = not (plan.slice_size or frame.in_tile_ranges or view.sub_frames or view.sample_rows)
             if complete and resident.count and not resident.streamed:
                 self._cache(resident, key, frame)
             return OpenCLImages(self, view, [frame.rendered()], resident.count)
@@ -130,8 +130,8 @@ class OpenCLPipeline(Pipeline):
             return False
 
     def render_undivided(self, resident: Resident, view: View) -> DeviceFrame:
-        """Render one frame without slices and bands; returns its buffers, valid until the next frame. Raises
-        DeviceError if it exceeds the memory budget."""
+        """Render one frame without slices and ranges of tiles; returns its buffers, valid until the next
+        frame. Raises DeviceError if it exceeds the memory budget."""
         if self._is_too_small_to_vectorise(resident):
             return self._unvectorised.render_undivided(resident, view)
         with self.workspace.rendering():
@@ -140,8 +140,8 @@ class OpenCLPipeline(Pipeline):
                 frame = self._render_planned(resident, view, plan)
             if frame is None or frame.pairs > self.workspace.pair_budget:
                 raise DeviceError(
-                    "frames with derivatives must fit the memory budget without slices or bands, got "
-                    f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller frames"
+                    "frames with derivatives must fit the memory budget without slices or ranges of tiles, "
+                    f"got {resident.count:,} splats; raise memory_budget, or use fewer splats or pixels"
                 )
             return frame
 
@@ -200,7 +200,7 @@ class OpenCLPipeline(Pipeline):
             cached.recorded = None  # after an interrupt the recording may be incomplete
             frame = self._render_frame(resident, view, cached.plan, commands, queue)
             rendered = frame.rendered()
-            if not frame.in_bands:
+            if not frame.in_tile_ranges:
                 cached.recorded = recorded = RecordedFrame(frame)
         if waits:
             return OpenCLImages(self, view, [rendered], resident.count)
@@ -287,8 +287,9 @@ class OpenCLPipeline(Pipeline):
 
     def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,)
-        uint32; lists (pairs,) uint32, of the last band; records (n,) of the struct `Splat`; raw (4, rows,
-        columns) float32: r, g, b, transmittance, unless they stay in registers; output images by name."""
+        uint32; lists (pairs,) uint32, of the last range of tiles; records (n,) of the struct `Splat`; raw (4,
+        rows, columns) float32: r, g, b, transmittance, unless they stay in registers; output images by
+        name."""
         with self.workspace.rendering():
             frame = self._render_frame(resident, view, MemoryPlan(0, resident.count, 0))
         images, raw = self.images_of(frame), {}

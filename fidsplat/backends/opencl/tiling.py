@@ -42,7 +42,7 @@ _LISTS = ("lists", "windows")
 reads after `emit`"""
 
 
-class TileBand(NamedTuple):
+class TileRange(NamedTuple):
     """Tiles [first, end) that are listed together, and their number of pairs."""
 
     first: int
@@ -91,8 +91,8 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     if frame.config.culls_first:
         size = frame.projected
     windows = _allocate_records(frame, size)
-    if frame.view.band is not None and size:
-        # the kernel writes no window for splats outside the band, so windows are first set to empty
+    if frame.view.sample_rows is not None and size:
+        # the kernel writes no window for splats outside `View.sample_rows`, so windows are first set to empty
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOW_BYTES * size)
     if count:
         resident, names = frame.resident, frame.source.cloud_arrays
@@ -150,12 +150,14 @@ def count_pairs(frame: DeviceFrame, count: int) -> Counts:
     return Counts.of_counters(frame.read("counters", np.uint32, (views, COUNTERS)))
 
 
-def sorted_bands(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterable[TileBand]:
-    """Split tiles [first, end) into as many bands as the pair budget requires."""
+def sorted_tile_ranges(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterable[TileRange]:
+    """Split tiles [first, end) into as many ranges as the pair budget requires."""
     budget = frame.workspace.pair_budget
     if pairs <= budget:
-        return [TileBand(first, end, pairs)]
-    return [TileBand(*band) for band in split_by_cost(tile_pairs(frame)[first:end], budget, first)]
+        return [TileRange(first, end, pairs)]
+    return [
+        TileRange(*tile_range) for tile_range in split_by_cost(tile_pairs(frame)[first:end], budget, first)
+    ]
 
 
 def tile_pairs(frame: DeviceFrame) -> np.ndarray:
@@ -163,11 +165,11 @@ def tile_pairs(frame: DeviceFrame) -> np.ndarray:
     return frame.read("bin totals", np.uint32, (frame.tiles,))
 
 
-def list_sorted(frame: DeviceFrame, band: TileBand, count: int) -> None:
+def list_sorted(frame: DeviceFrame, tile_range: TileRange, count: int) -> None:
     allocated, budget = frame.pool.size("lists") // 4, frame.workspace.pair_budget
-    size = enlarged(band.pairs, budget) if 0 < allocated < band.pairs else band.pairs
+    size = enlarged(tile_range.pairs, budget) if 0 < allocated < tile_range.pairs else tile_range.pairs
     frame.scratch("lists", 4 * size)
-    arguments = {"band_first": band.first, "band_end": band.end, "count": count}
+    arguments = {"first_tile": tile_range.first, "end_tile": tile_range.end, "count": count}
     table = frame.named["bin table"]
     frame.launch("bin", "bin_emit", (frame.config.sort_blocks,), (1,), frame.views, table=table, **arguments)
 
@@ -291,16 +293,16 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     return frame.launch("bin", "tile_starts", (work_groups * items,), (items,), **arguments)
 
 
-def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band: bool) -> None:
+def list_and_sort(frame: DeviceFrame, tile_range: TileRange, capacity: int, counts_visible: bool) -> None:
     frame.scratch("pairs", 8 * capacity)
-    shared = frame.config.culls_first and not frame.in_bands
+    shared = frame.config.culls_first and not frame.in_tile_ranges
     frame.bind("lists", frame.pool.scratch(_LISTS[shared], 4 * capacity))
     count, views, work_groups = frame.projected, frame.views, _big_groups(frame)
     arguments = {
-        "band_first": band.first,
-        "band_end": band.end,
+        "first_tile": tile_range.first,
+        "end_tile": tile_range.end,
         "capacity": capacity,
-        "first_band": first_band,
+        "counts_visible": counts_visible,
     }
     if frame.config.binning == "bin_local":  # big splats, then all others
         frame.launch(
@@ -313,18 +315,20 @@ def list_and_sort(frame: DeviceFrame, band: TileBand, capacity: int, first_band:
         frame.launch(
             "bin", "emit", (items,), (_ITEMS,), views, count=count, splat_groups=splat_groups, **arguments
         )
-    arguments = {"band_first": band.first, "clear": not frame.waits}
-    frame.launch("sort", "sort_tiles", ((band.end - band.first) * _ITEMS,), (_ITEMS,), **arguments)
+    arguments = {"first_tile": tile_range.first, "clear": not frame.waits}
+    frame.launch(
+        "sort", "sort_tiles", ((tile_range.end - tile_range.first) * _ITEMS,), (_ITEMS,), **arguments
+    )
 
 
-def unsorted_bands(frame: DeviceFrame, pairs: int) -> list[TileBand]:
-    """Split all tiles into as many bands as the pair budget requires."""
+def unsorted_tile_ranges(frame: DeviceFrame, pairs: int) -> list[TileRange]:
+    """Split all tiles into as many ranges as the pair budget requires."""
     budget = frame.workspace.pair_budget
     if pairs <= budget:
-        return [TileBand(0, frame.tiles, pairs)]
-    frame.in_bands = True
+        return [TileRange(0, frame.tiles, pairs)]
+    frame.in_tile_ranges = True
     counters = frame.read("counters", np.uint32, (COUNTERS + frame.tiles,))
-    return [TileBand(*band) for band in split_by_cost(counters[COUNTERS:], budget)]
+    return [TileRange(*tile_range) for tile_range in split_by_cost(counters[COUNTERS:], budget)]
 
 
 def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:

@@ -41,8 +41,8 @@ def projection_arrays(
     view = views.view
     if view.device_record is not None:
         return {"view": view.device_record}
-    if view.band is not None:
-        row, end = max(row, view.band[0]), min(end, view.band[1])
+    if view.sample_rows is not None:
+        row, end = max(row, view.sample_rows[0]), min(end, view.sample_rows[1])
     arrays = {"view": view_records(views, row, end, source.records["View"])}
     if view.groups:
         arrays["moving"] = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
@@ -75,7 +75,12 @@ def _record_values(view: View, row: int, end: int, record: np.dtype) -> list[flo
         **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},
         **{"center_x": view.center_x, "center_y": view.center_y, "near": view.near, "far": view.far},
         **{"log_alpha_cutoff": view.log_alpha_cutoff, "width": view.width, "height": view.height},
-        **{"sample_area": 1.0 / view.samples**2, "band": row, "band_end": end, "ewa_clamp": view.ewa_clamp},
+        **{
+            "sample_area": 1.0 / view.samples**2,
+            "first_row": row,
+            "end_row": end,
+            "ewa_clamp": view.ewa_clamp,
+        },
     }
     # then the members of a lens and its inverse lookup table
     lens = iter(() if view.raster is None else view.raster.uniforms)

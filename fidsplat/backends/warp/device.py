@@ -65,8 +65,8 @@ class WarpBackend(Workspace, Backend):
         self._gradients: dict[tuple[FeatureSet, KernelConfig], WarpGradients] = {}
 
     def limit_memory(self, budget: int) -> None:
-        """Limit a frame and its cloud to `budget` bytes: longer lists are split into bands of tiles, a larger
-        cloud is an error."""
+        """Limit a frame and its cloud to `budget` bytes: longer lists are split into ranges of tiles; a
+        larger cloud is an error."""
         self.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:

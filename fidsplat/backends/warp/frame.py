@@ -2,7 +2,7 @@
 
 Splats, tiles and samples of all views are numbered consecutively, view after view. After projection the host
 reads the number of (splat, tile) pairs, which is the size of the lists. A frame with more pairs than the
-memory budget allows is rendered in bands of tiles. A frame like an earlier one does not wait for this
+memory budget allows is rendered in ranges of tiles. A frame like an earlier one does not wait for this
 number: its lists have the capacity that earlier frames needed, and are empty if `totals` on the device
 exceeds it; pipeline.py then renders the frame again.
 """
@@ -69,8 +69,8 @@ class DeviceFrame:
         """rows and columns of samples of a view"""
         self.named: dict[str, Any] = {}
         """arrays and structs by the names of the kernels' parameters"""
-        self.bands = 0
-        """number of bands of tiles in which the frame was rendered"""
+        self.tile_ranges = 0
+        """number of ranges of tiles in which the frame was rendered"""
         self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
         self.set_views(batch)
 
@@ -141,8 +141,8 @@ class DeviceFrame:
         self.launcher.stage("project")
         visible, pairs = self._project()
         samples = self._samples("raw")
-        for first, end, listed in self._bands(pairs):
-            self.bands += 1
+        for first, end, listed in self._tile_ranges(pairs):
+            self.tile_ranges += 1
             self.launcher.stage("bin")
             self._bin(first, end, listed, complete=listed == pairs)
             self.launcher.stage("sort")
@@ -189,17 +189,17 @@ class DeviceFrame:
     def _list_big(self, arguments: dict[str, Any], first: int = 0, end: int | None = None) -> None:
         """Count or list the tiles of big splats."""
         blocks = 8 * self.pool.device.sm_count if self.pool.device.is_cuda else 64
-        band = {"band_first": first, "band_end": self.tiles if end is None else end, "blocks": blocks}
-        self.launcher.launch_blocks(self.program.list_big, 0, blocks, self.named | band | arguments)
+        tiles = {"first_tile": first, "end_tile": self.tiles if end is None else end, "blocks": blocks}
+        self.launcher.launch_blocks(self.program.list_big, 0, blocks, self.named | tiles | arguments)
 
     def _start_lists(self, first: int, end: int, capacity: int) -> None:
-        """Compute the starts of the lists of a band of tiles."""
-        arguments, lists = {"band_end": end, "capacity": capacity}, self.program.lists
+        """Compute the starts of the lists of a range of tiles."""
+        arguments, lists = {"end_tile": end, "capacity": capacity}, self.program.lists
         self.launcher.launch_blocks(
             lists.start_lists, first, first + 1, self.named | arguments, lists.START_BLOCK
         )
 
-    def _bands(self, pairs: int) -> Iterator[tuple[int, int, int]]:
+    def _tile_ranges(self, pairs: int) -> Iterator[tuple[int, int, int]]:
         """Split the tiles into ranges (first, end, pairs) whose lists fit the budgets; usually one."""
         limit = self.planner.max_pairs(self.resident, self.batch, self.reserved)
         if pairs <= limit:
@@ -208,23 +208,23 @@ class DeviceFrame:
         return split_by_cost(lengths[: self.tiles], limit)
 
     def fits(self, capacity: int) -> bool:
-        """Whether a frame with this number of pairs fits the budgets in one band."""
+        """Whether a frame with this number of pairs fits the budgets in one range of tiles."""
         try:
             return capacity <= self.planner.max_pairs(self.resident, self.batch, self.reserved)
         except DeviceError:
             return False
 
     def _bin(self, first: int, end: int, pairs: int, complete: bool) -> None:
-        """Write the pairs of one band. complete: whether the band has all tiles."""
+        """Write the pairs of a range of tiles. complete: whether it has all tiles."""
         self._scratch("pairs", pairs, self.wp.uint64)
         self._scratch("lists", pairs, self.wp.int32)
         if not complete:
             self._start_lists(first, end, pairs)
-        band = {"band_first": first, "band_end": end, "capacity": pairs, "splats": self.splats}
+        tiles = {"first_tile": first, "end_tile": end, "capacity": pairs, "splats": self.splats}
         if self.splats:
             self._list_big({"first_cursor": 0, "capacity": pairs}, first, end)
             # complete blocks
-            self._launch(self.program.lists.list_windows, -(-self.splats // BLOCK) * BLOCK, **band)
+            self._launch(self.program.lists.list_windows, -(-self.splats // BLOCK) * BLOCK, **tiles)
 
     def _samples(self, kind: str) -> Any:
         samples = self.program.samples_type()
@@ -242,7 +242,7 @@ class DeviceFrame:
         if config.schedule == "group":
             count = (end - first) * program.blend_block
             self.launcher.launch_undivided(
-                program.blend, count, arguments | {"band_first": first}, program.blend_block
+                program.blend, count, arguments | {"first_tile": first}, program.blend_block
             )
             return
         arguments["state"] = self._scratch("state", self.launcher.parts * area, program.state)

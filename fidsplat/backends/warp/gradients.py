@@ -47,9 +47,9 @@ class WarpGradients(GradientPipeline):
     def forward(self, resident: Resident, view: View, waits: bool = True) -> WarpDifferentiable:
         """Render one view; always waits."""
         frame, images = self._pipeline.render_counted(resident, view)
-        if frame.bands > 1:
+        if frame.tile_ranges > 1:
             raise DeviceError(
-                "frames with derivatives must fit the memory budget without bands, got "
+                "frames with derivatives must fit the memory budget without ranges of tiles, got "
                 f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller images"
             )
         return WarpDifferentiable(frame, images)
@@ -126,7 +126,7 @@ class _Backward:
         self._arguments["checkpoints"] = self._exact("checkpoints", checkpoints, wp.float32)
         kernel, tiles = made.blend.kernel, frame.tiles
         if config.schedule == "group":
-            arguments = self._arguments | {"band_first": 0}
+            arguments = self._arguments | {"first_tile": 0}
             self._launcher.launch_undivided(kernel, tiles * area, arguments, area)
             return
         states = self._launcher.parts * area

@@ -110,8 +110,8 @@ class WarpPipeline(Pipeline):
 
     def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,);
-        lists (pairs,), of the last band; records (n, words) float32; raw (4, rows, columns) float32: r, g,
-        b, transmittance; output images by name."""
+        lists (pairs,), of the last range of tiles; records (n, words) float32; raw (4, rows, columns)
+        float32: r, g, b, transmittance; output images by name."""
         frame, images = self.render_counted(resident, view)
         named, stats, n = frame.named, images.stats, resident.count
         rows, stride = frame.grid

@@ -7,12 +7,12 @@
     real margin = REAL(0.5) * larger + 4, sphere = extent + REAL(1.001) * larger * fmax(max_scale, (real)MIN_SCALE);    // for rounding
     real left = view->center_x + margin, right = view->center_x - view->width - margin;
     real above = view->center_y + margin, below = view->center_y - view->height - margin;
-    real above_band = above - view->band, below_band = view->center_y - view->band_end - margin;
+    real above_band = above - view->first_row, below_band = view->center_y - view->end_row - margin;
     real to_x = view->focal_x * p.x, to_y = view->focal_y * p.y;
     // |n_x| + |n_z| >= |n|; a NaN is not culled
     if (to_x + left * p.z < -sphere * (view->focal_x + fabs(left)) || to_x + right * p.z > sphere * (view->focal_x + fabs(right))
         || to_y + above * p.z < -sphere * (view->focal_y + fabs(above))
         || to_y + below * p.z > sphere * (view->focal_y + fabs(below))) return CULLED;
     // not for a complete image, whose last row of tiles may reach below it
-    if ((view->band > 0 && to_y + above_band * p.z < -sphere * (view->focal_y + fabs(above_band)))
-        || (view->band_end < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) return OUT_OF_BAND;
+    if ((view->first_row > 0 && to_y + above_band * p.z < -sphere * (view->focal_y + fabs(above_band)))
+        || (view->end_row < view->height && to_y + below_band * p.z > sphere * (view->focal_y + fabs(below_band)))) return OUT_OF_BAND;

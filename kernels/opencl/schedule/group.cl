@@ -20,7 +20,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     local uchar cell_splats[CELLS_X * CELLS_Y][CELLS_STRIDE];    // [cell]: staged splats that overlap it, in order
     local int alive;
     const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area};
-    uint tile = longest_first ? tile_order[get_group_id(0)] : band_first + get_group_id(0), item = get_local_id(0);
+    uint tile = longest_first ? tile_order[get_group_id(0)] : first_tile + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     uint view_index = tile / (uint)(tiles_x * tiles_y), here = tile - view_index * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
@@ -34,7 +34,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ group_start
 //@@ pixels_start
 
-    uint base = starts[band_first], start = starts[tile] - base, end = starts[tile + 1] - base;
+    uint base = starts[first_tile], start = starts[tile] - base, end = starts[tile + 1] - base;
 //@@ pass
     for (uint batch = start, length; batch < end; batch += length) {
         length = min(end - batch, (uint)STAGED);

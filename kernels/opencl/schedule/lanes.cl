@@ -10,11 +10,11 @@ kernel void blend(
 //@@ arguments blend
 ) {
     const BlendConstants constants = {log_alpha_cutoff, opacity_ceiling, transmittance_stop, sample_area};
-    uint tile = band_first + get_global_id(0);
+    uint tile = first_tile + get_global_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     const uint view_tiles = (uint)(tiles_x * tiles_y), view_index = tile / view_tiles, across = (uint)tiles_x;
     uint here = tile - view_index * view_tiles, column = here % across, row = here / across;
-    if (band_first % view_tiles == 0 && get_global_size(0) % view_tiles == 0) {
+    if (first_tile % view_tiles == 0 && get_global_size(0) % view_tiles == 0) {
         // complete views: bands of rows column by column, since neighbours share splats in the cache
         uint first = here / (ROWS_TOGETHER * across) * ROWS_TOGETHER, rows = min((uint)ROWS_TOGETHER, (uint)tiles_y - first);
         column = (here - first * across) / rows;
@@ -24,7 +24,7 @@ kernel void blend(
     int x0 = (int)column * TILE_W, y0 = (int)row * TILE_H;
 
     // in a tile without splats all blocks are equal, so only one is computed
-    const uint base = starts[band_first];
+    const uint base = starts[first_tile];
     const bool empty = starts[tile] == starts[tile + 1]
 //@@ empty
         ;
