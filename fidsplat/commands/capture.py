@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import tyro
 
 from fidsplat.commands.options import Json, repeatable
 from fidsplat.commands.output import delayed_progress, report
+from fidsplat.photographs.dataset import SPLATS
 from fidsplat.photographs.settings import CaptureSettings
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Capture:
 def _facts(captured: Captured) -> dict[str, Any]:
     adjusted = captured.adjustment
     facts: dict[str, Any] = {
-        "scene": str(captured.scene),
+        "scene": str(captured.files.scene),
         "photographs": captured.photographs,
         "registered": len(captured.model.names),
         "missing": dict(captured.missing),
@@ -63,9 +63,10 @@ def _facts(captured: Captured) -> dict[str, Any]:
         "reprojection_px": captured.model.reprojection,
         "metric": captured.scale_error is not None,
         "readout_px": captured.readout,
+        "renamed": {str(file): str(new) for file, new in captured.files.renamed},
         "cameras": [
             {"scene": str(file), "size": [camera.width, camera.height], "fx": camera.fx, "photographs": count}
-            for file, camera, count in captured.cameras
+            for file, camera, count in captured.files.cameras
         ],
     }
     if captured.scale_error is not None:
@@ -94,10 +95,10 @@ def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> li
         f"reprojection error {facts['reprojection_px']:.2f} px"
     ]
     lines += [f"no camera for {name}: {reason}" for name, reason in captured.missing]
-    if len(captured.cameras) > 1:
+    if len(captured.files.cameras) > 1:
         lines += [
             f"{file.name}: {camera.width} x {camera.height}, fx {camera.fx:.0f} px, {count} photographs"
-            for file, camera, count in captured.cameras
+            for file, camera, count in captured.files.cameras
         ]
     if captured.scale_error is None:
         lines.append("lengths are not in metres; give --tag SPEC=METRES, or --scale A,B=METRES")
@@ -127,11 +128,20 @@ def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> li
             "photographs with the camera held still, or give --lens"
         )
     lines += [f"{spec} was not detected" for spec in captured.undetected]
-    splats = Path(out) / "splats.ply"
-    again = " again if tags, --up or --scale changed" if splats.exists() else ""
-    folder, file, scene = (quote(str(path)) for path in (out, splats, captured.scene))
-    lines.append(
-        f"train it{again}: fidsplat train {folder} -o {file}{' --overwrite' if again else ''}; then view it: "
-        f"fidsplat view {scene}"
-    )
+    splats = captured.files.scene.with_name(SPLATS)
+    old = {file: new.name for file, new in captured.files.renamed}
+    lines += [
+        f"{file.name} was edited and is now {name}; copy your changes to the new {file.name}"
+        for file, name in old.items()
+        if file != splats
+    ]
+    folder, file, scene = (quote(str(path)) for path in (out, splats, captured.files.scene))
+    train, view = f"fidsplat train {folder} -o {file}", f"fidsplat view {scene}"
+    if splats in old:
+        lines.append(
+            f"{splats.name} was trained at other poses and is now {old[splats]}; train again: {train} "
+            f"--overwrite; then view it: {view}"
+        )
+    else:
+        lines.append(f"view it: {view}" if splats.exists() else f"train it: {train}; then view it: {view}")
     return lines

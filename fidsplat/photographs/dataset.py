@@ -4,7 +4,8 @@ file."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from fidsplat.photographs.tags import box_of, module_colors
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.scene import Scene
 from fidsplat.train.boxes import EDGE, marker_mask, outside_boxes
-from fidsplat.util.files import atomic_write, write_json
+from fidsplat.util.files import atomic_write, write_file, write_json
 from fidsplat.util.progress import Progress
 from fidsplat.vision.undistort import undistort_masked
 
@@ -109,8 +110,21 @@ def _printed(tag: PlacedMarker, colors: Sequence[tuple[np.ndarray, np.ndarray]])
     )
 
 
+@dataclass(frozen=True)
+class Written:
+    """Files of a written model."""
+
+    scene: Path
+    """scene file of the undistorted images"""
+    cameras: tuple[tuple[Path, Camera, int], ...]
+    """scene file of each camera of the photographs, the camera, and its number of photographs"""
+    renamed: tuple[tuple[Path, Path], ...]
+    """edited scene files, and splats that were trained at other poses, with their new names"""
+
+
 def write_model(
     folder: Path,
+    copies: Path,
     names: Sequence[str],
     cameras: Sequence[Camera],
     points: np.ndarray,
@@ -118,13 +132,13 @@ def write_model(
     tags: Sequence[PlacedMarker],
     visible: Sequence[Sequence[str]],
     photographed: Sequence[Camera],
-) -> tuple[Path, list[tuple[Path, Camera, int]]]:
+) -> Written:
     """Write COLMAP's model of the undistorted images, without points in the boxes of tags, dataset.json with
-    these boxes, and scene files with the tags. Returns the scene file of the undistorted images, and of each
-    camera of the photographs the scene file, the camera and its number of photographs.
+    these boxes, and scene files with the tags.
 
-    photographed: cameras of the photographs.
+    copies: folder for copies of the scene files, which later runs compare with edited ones.
     visible: for each tag the names of the photographs in which it was detected.
+    photographed: cameras of the photographs.
     """
     boxes = [box_of(tag) for tag in tags]
     free = outside_boxes(points, boxes)
@@ -132,21 +146,49 @@ def write_model(
         {"matrix": box.tolist(), "visible": [_image_name(name) for name in photographs]}
         for box, photographs in zip(boxes, visible, strict=True)
     ]
-    write_json(folder / "dataset.json", {"boxes": table})
-    save_colmap(
-        folder / "sparse" / "0", [_image_name(name) for name in names], cameras, points[free], colors[free]
-    )
-    for file in folder.glob(OTHER_PHOTOGRAPHS):
-        file.unlink()
+    model = folder / "sparse" / "0"
+    files = folder / "dataset.json", model / "images.bin"
+    before = [file.read_bytes() if file.is_file() else b"" for file in files]
+    write_json(files[0], {"boxes": table})
+    save_colmap(model, [_image_name(name) for name in names], cameras, points[free], colors[free])
+    renamed = []
+    splats = folder / SPLATS
+    if splats.exists() and before != [file.read_bytes() for file in files]:
+        renamed.append((splats, _renamed(splats)))
     shared: dict[tuple, list[Camera]] = {}
     for camera in photographed:
         shared.setdefault((camera.width, camera.height, camera.fx, camera.fy, camera.lens), []).append(camera)
     groups = sorted(shared.values(), key=len, reverse=True)
     stem, suffix = Path(PHOTOGRAPHS).stem, Path(PHOTOGRAPHS).suffix
-    files = [folder / PHOTOGRAPHS, *(folder / f"{stem}-{i}{suffix}" for i in range(2, len(groups) + 1))]
-    scene = folder / "scene.toml"
-    for file, camera in (scene, cameras[0]), *zip(files, (group[0] for group in groups), strict=True):
-        Scene(camera=camera, markers=tuple(tags)).save(file)
-        with atomic_write(file) as stream:
-            stream.write(file.read_bytes() + f'\n[[splats]]\nfile = "{SPLATS}"\n'.encode())
-    return scene, [(file, group[0], len(group)) for file, group in zip(files, groups, strict=True)]
+    ours = [PHOTOGRAPHS, *(f"{stem}-{i}{suffix}" for i in range(2, len(groups) + 1))]
+    scenes = dict(zip(ours, (group[0] for group in groups), strict=True)) | {"scene.toml": cameras[0]}
+    copies.mkdir(exist_ok=True)
+    for file in {*copies.glob("*.toml"), *(copies / name for name in scenes)}:
+        target, old = folder / file.name, file.read_bytes() if file.exists() else b""
+        content = b"" if file.name not in scenes else _scene_file(file, scenes[file.name], tags)
+        if content == old and target.exists():
+            continue  # also if it was edited
+        if target.exists() and target.read_bytes() != old:
+            renamed.append((target, _renamed(target)))
+        if content:
+            write_file(target, content)
+        else:  # a camera of earlier photographs
+            file.unlink()
+            target.unlink(missing_ok=True)
+    found = tuple((folder / name, group[0], len(group)) for name, group in zip(ours, groups, strict=True))
+    return Written(folder / "scene.toml", found, tuple(sorted(renamed)))
+
+
+def _scene_file(file: Path, camera: Camera, tags: Sequence[PlacedMarker]) -> bytes:
+    """Write a scene with tags and the trained splats to a file; returns its content."""
+    Scene(camera=camera, markers=tuple(tags)).save(file)
+    content = file.read_bytes() + f'\n[[splats]]\nfile = "{SPLATS}"\n'.encode()
+    write_file(file, content)
+    return content
+
+
+def _renamed(file: Path) -> Path:
+    """Rename a file to a free name; returns the new path."""
+    name = (f"{file.stem}.old{'' if i == 1 else i}{file.suffix}" for i in count(1))
+    target = next(path for path in (file.with_name(each) for each in name) if not path.exists())
+    return file.rename(target)

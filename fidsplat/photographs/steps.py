@@ -10,10 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.cameras import Camera
 from fidsplat.markers import marker
 from fidsplat.photographs.adjustment import Adjustment, adjust
-from fidsplat.photographs.dataset import OTHER_PHOTOGRAPHS, PHOTOGRAPHS, scaled, write_images, write_model
+from fidsplat.photographs.dataset import (
+    OTHER_PHOTOGRAPHS,
+    PHOTOGRAPHS,
+    Written,
+    scaled,
+    write_images,
+    write_model,
+)
 from fidsplat.photographs.frame import WorldFrame, world_frame
 from fidsplat.photographs.mapping import (
     Model,
@@ -37,6 +43,8 @@ from fidsplat.util.progress import Progress, no_progress
 INPUTS = "inputs.json"
 SKIPPED = "skipped.json"
 """file in `work` with the photographs that cannot be read, each with the reason"""
+SCENES = "scenes"
+"""folder in `work` with copies of the scene files"""
 WRITTEN = "written"
 """empty file in `work` once OUTPUTS are of this command"""
 OUTPUTS = "images", "masks", "sparse", "dataset.json", "scene.toml", PHOTOGRAPHS
@@ -46,8 +54,7 @@ OUTPUTS = "images", "masks", "sparse", "dataset.json", "scene.toml", PHOTOGRAPHS
 class Captured:
     """A data set made from photographs."""
 
-    scene: Path
-    """scene file with the tags"""
+    files: Written
     photographs: int
     model: Model
     frame: WorldFrame
@@ -61,8 +68,6 @@ class Captured:
     """relative standard error of the scale; None if lengths are not in metres"""
     readout: float
     """displacement of rows by motion during the readout [px]; 0 unless a rolling shutter is likely"""
-    cameras: tuple[tuple[Path, Camera, int], ...]
-    """scene file of each camera of the photographs, the camera, and its number of photographs"""
 
 
 def photographs_to_scene(
@@ -146,8 +151,8 @@ def photographs_to_scene(
     used = () if adjustment is None else adjustment.used
     visible = [[model.names[view.image] for view in used if view.tag == tag.marker.spec] for tag in placed]
     points = frame.points(model.points)
-    scene, photographed = write_model(
-        folder, model.names, small, points, model.colors, placed, visible, cameras
+    written = write_model(
+        folder, work / SCENES, model.names, small, points, model.colors, placed, visible, cameras
     )
     missing = [(name, reason) for name, reason in skipped]
     missing += [(names.get(name_key(name), name), why) for name, why in unregistered(database, model.names)]
@@ -155,7 +160,7 @@ def photographs_to_scene(
     readout = displaced if fraction > MIN_FRACTION and displaced > MIN_DISPLACEMENT else 0.0
     undetected = tuple(spec for spec in tags if adjustment is None or spec not in adjustment.poses)
     return Captured(
-        scene,
+        written,
         count,
         model,
         frame,
@@ -165,7 +170,6 @@ def photographs_to_scene(
         tuple(missing),
         picked_error if adjustment is None else adjustment.scale_error,
         readout,
-        tuple(photographed),
     )
 
 
@@ -216,8 +220,11 @@ def _work_folder(folder: Path, files: list[Path], settings: CaptureSettings, ove
     stats = [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files]
     inputs = {"files": stats, "lens": settings.lens, "frames": settings.frames if len(files) == 1 else None}
     if overwrite:
-        for name in ("work", "images", "masks"):
-            shutil.rmtree(folder / name, ignore_errors=True)
+        for path in (*work.glob("*"), folder / "images", folder / "masks"):
+            if path.is_dir() and path.name != SCENES:
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.is_file():
+                path.unlink()
     work.mkdir(exist_ok=True)
     if overwrite:
         (work / WRITTEN).touch()

@@ -229,6 +229,38 @@ def test_a_capture_that_was_interrupted_at_its_start_resumes(photos, tmp_path, c
     assert prints_json(capsys, "capture", photos, "-o", tmp_path / "out")["registered"] == 5
 
 
+def test_edited_scene_files_and_splats_of_other_poses_are_renamed(photos, captured, tmp_path, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(captured[0], out)
+    words = [photos, "-o", out, *ARGUMENTS, "--up", "apriltag:36h11:9"]
+    edited = (
+        (out / "scene.toml").read_text().replace("background = [0.0, 0.0, 0.0]", "background = [1.0, 0, 0]")
+    )
+    (out / "scene.toml").write_text(edited)
+    (out / "splats.ply").write_text("mine")
+    assert main(["capture", *map(str, words)]) == 0  # with the same result
+    assert "view it: " in (printed := capsys.readouterr().out)
+    assert "train" not in printed
+    assert (out / "scene.toml").read_text() == edited
+    assert (out / "splats.ply").read_text() == "mine"
+    for end in ("old", "old2"):
+        words = [
+            word.replace("=0.2", "=0.1" if end == "old" else "=0.3") if isinstance(word, str) else word
+            for word in words
+        ]
+        (out / "scene.toml").write_text(edited)
+        (out / "splats.ply").write_text(end)
+        assert main(["capture", *map(str, words)]) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert f"scene.toml was edited and is now scene.{end}.toml" in printed
+        assert f"splats.ply was trained at other poses and is now splats.{end}.ply" in printed
+        assert (out / f"scene.{end}.toml").read_text() == edited
+        assert (out / f"splats.{end}.ply").read_text() == end
+        assert not (out / "splats.ply").exists()
+        assert "background = [0.0, 0.0, 0.0]" in (out / "scene.toml").read_text()
+        words = [word.replace("=0.1", "=0.2") if isinstance(word, str) else word for word in words]
+
+
 def test_only_folders_of_an_earlier_capture_are_replaced(photos, tmp_path, capsys):
     garden = tmp_path / "garden"
     shutil.copytree(photos, garden / "images")
