@@ -19,7 +19,7 @@ from fidsplat.train.optimiser import HIGHER_SH_RATE
 from fidsplat.train.parameters import NAMES, SHAPES, Splats
 from fidsplat.train.random_numbers import RandomStream
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.view_refinement import ViewRefinement
+from fidsplat.train.view_refinement import ViewRefinement, ViewStep
 
 _PREFIXES = ("", "first_", "second_")
 _STATISTICS = ("gradient_sums", "visible_counts")
@@ -101,9 +101,7 @@ class DeviceModel:
 
     def refined_view(self, pipeline: Any, view: View, number: int) -> View:
         """The uniforms of view `number` with the refined camera."""
-        if not self._settings.refines_cameras:
-            return view
-        return self._kernels.refined_view(pipeline, view, number)
+        return view if self._refinement is None else self._kernels.refined_view(pipeline, view, number)
 
     def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], Any]:
         """A function that waits for the loss of a rendered view, and the gradient (h, w, 3) on the device."""
@@ -131,8 +129,10 @@ class DeviceModel:
         step: int,
         camera: Camera | None,
         origin: np.ndarray,
+        view_step: ViewStep | None = None,
     ) -> None:
-        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
+        """Apply one step of Adam. camera: if given, statistics are accumulated first. view_step: if given,
+        the view's camera and exposure are refined."""
         settings, count = self._settings, max(1, self._number)
         correction = 1 / (1 - settings.beta1**step)
         sizes = {name.removeprefix("log_"): correction * value for name, value in rate.items()}
@@ -145,23 +145,25 @@ class DeviceModel:
             "scale_penalty": settings.scale_penalty / (settings.axes * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }
-        self._kernels.step(by_tiles, sizes, numbers, camera is not None, settings.refines_cameras)
+        refined = None if view_step is None else self._refine_intrinsics(by_tiles, view_step)
+        self._kernels.step(by_tiles, sizes, numbers, camera is not None, refined)
 
-    def refine_view(self, by_tiles: Any, view: int, iteration: int) -> None:
-        """Apply the step of a view's camera and exposure, after `step`."""
-        refinement, settings, kernels = self._refinement, self._settings, self._kernels
+    def _refine_intrinsics(self, by_tiles: Any, step: ViewStep) -> dict[str, Any]:
+        """Apply the due steps of the intrinsics; returns the numbers of the kernel `refine_view`."""
+        refinement, settings, view = self._refinement, self._settings, step.view
         assert refinement is not None
-        betas = {"beta1": settings.beta1, "beta2": settings.beta2}
-        if settings.refines_cameras:
-            args = {"row": view, "intrinsics_row": refinement.rows[view], "depth": refinement.depths[view]}
-            args |= betas | {"refine_pose": int(settings.refine_poses)}
-            args |= refinement.pose_step(view, iteration)
-            kernels.refine_camera(by_tiles, args)
-            for row in refinement.due_intrinsics(view, iteration):
-                step = betas | refinement.intrinsics_step(row, iteration)
-                kernels.refine_intrinsics(by_tiles, step | {"intrinsics_row": row}, len(self._cameras))
-        if settings.fit_exposures:
-            kernels.refine_exposure(betas | {"row": view} | refinement.exposure_step(view, iteration))
+        for row in refinement.due_intrinsics(step):
+            numbers = refinement.intrinsics_step(row, step.iteration)
+            numbers |= {"beta1": settings.beta1, "beta2": settings.beta2, "intrinsics_row": row}
+            self._kernels.refine_intrinsics(by_tiles, numbers, len(self._cameras))
+        return {
+            **{"view_index": view, "next_view": step.next_view, "intrinsics_row": refinement.rows[view]},
+            **{"refine_pose": int(settings.refine_poses), "depth": refinement.depths[view]},
+            **{"refine_intrinsics": int(settings.refine_intrinsics)},
+            **{"refine_exposure": int(settings.fit_exposures)},
+            **refinement.pose_step(view, step.iteration),
+            **{f"exposure_{name}": v for name, v in refinement.exposure_step(view, step.iteration).items()},
+        }
 
     def centre_exposures(self) -> None:
         """Set the means of the exposures over the views to 0; the splats' colours then compensate."""

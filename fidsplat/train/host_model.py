@@ -18,7 +18,7 @@ from fidsplat.train.losses import Loss, exposed_loss, normal_loss
 from fidsplat.train.optimiser import adam_step, contributing, parameter_gradients, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.view_refinement import ViewRefinement
+from fidsplat.train.view_refinement import ViewRefinement, ViewStep
 
 _REACH = 3.0
 """radius of a splat's bounding sphere for the visibility statistic, in standard deviations"""
@@ -122,8 +122,10 @@ class HostModel:
         step: int,
         camera: Camera | None,
         origin: np.ndarray,
+        view_step: ViewStep | None = None,
     ) -> None:
-        """Apply one step of Adam. camera: if given, statistics are accumulated first."""
+        """Apply one step of Adam. camera: if given, statistics are accumulated first. view_step: if given,
+        the view's camera and exposure are refined."""
         if camera is not None:
             self.accumulate_statistics(gradients, camera, origin)
         arrays = {name: on_host(array) for name, array in gradients.items()}
@@ -133,16 +135,18 @@ class HostModel:
         else:
             adam_step(self._splats, raw, rate, self._settings, step)
 
-    def refine_view(self, gradients: Mapping[str, Any], view: int, iteration: int) -> None:
-        """Apply the step of a view's camera and exposure, after `step`."""
-        refinement, settings = self._refinement, self._settings
+        if view_step is not None:
+            self._refine_view(arrays, view_step)
+
+    def _refine_view(self, gradients: Mapping[str, np.ndarray], step: ViewStep) -> None:
+        refinement, settings, view, iteration = self._refinement, self._settings, step.view, step.iteration
         assert refinement is not None
-        if settings.refine_poses:
-            refinement.move(view, on_host(gradients["pose"]), iteration)
-        if settings.refine_intrinsics:
-            refinement.add_intrinsics(view, on_host(gradients["intrinsics"]))
-        for row in refinement.due_intrinsics(view, iteration):
+        for row in refinement.due_intrinsics(step):
             refinement.change_intrinsics(row, iteration)
+        if settings.refine_poses:
+            refinement.move(view, gradients["pose"], iteration)
+        if settings.refine_intrinsics:
+            refinement.add_intrinsics(view, gradients["intrinsics"])
         if self._by_exposure is not None:
             refinement.expose(view, self._by_exposure, iteration)
 

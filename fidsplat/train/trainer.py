@@ -37,7 +37,7 @@ from fidsplat.train.parameters import Splats, TrainingError, initial_splats, spl
 from fidsplat.train.random_numbers import RandomStream, permutation
 from fidsplat.train.scores import ViewScore, score_view
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.view_refinement import ViewRefinement, with_exposure_of
+from fidsplat.train.view_refinement import ViewRefinement, ViewStep, with_exposure_of
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import callback, instance, invalid, items, settings_with
 from fidsplat.util.errors import DeviceError, InputError
@@ -516,9 +516,10 @@ class Trainer:
             return
         counted = camera if not mcmc_runs and iteration < settings.densify_until else None
         rate = learning_rates(settings, iteration, self.dataset.extent)
-        self._model.step(gradients, rate, settings.adam_steps(iteration), counted, origin)
+        view_step = None
         if self._refinement is not None:
-            self._model.refine_view(gradients, number, iteration)
+            view_step = ViewStep(number, iteration, self._view_at(iteration + 1))
+        self._model.step(gradients, rate, settings.adam_steps(iteration), counted, origin, view_step)
         if mcmc_runs:
             with self._all_or_failed():
                 if settings.densifies_after(iteration):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,9 +56,19 @@ class _Adam:
         return rate * (-mean / (np.sqrt(square.mean(axis=1, keepdims=True)) + _EPSILON)).ravel()
 
 
+class ViewStep(NamedTuple):
+    """A step of the refinement of a view."""
+
+    view: int
+    """index of the view of the frame"""
+    iteration: int
+    next_view: int
+    """index of the view of the next frame"""
+
+
 class ViewRefinement:
     """Refined cameras and exposures of the training views. On devices with training kernels the arrays are
-    updated in device memory (kernels/opencl/train/refine_camera.cl), and copied here for reports."""
+    updated in device memory (kernels/opencl/train/refine_view.cl), and copied here for reports."""
 
     def __init__(self, dataset: Dataset, settings: TrainSettings) -> None:
         self._settings, self._origin = settings, dataset.origin
@@ -127,15 +138,16 @@ class ViewRefinement:
         """Add a gradient (4,) of the loss of a view by its intrinsics to the sums."""
         self._intrinsics_sums[self.rows[view]] += by_intrinsics
 
-    def due_intrinsics(self, view: int, iteration: int) -> list[int]:
-        """Note that the sums of a view's row have a gradient; returns the rows whose step is due after an
-        iteration: the one before each multiple of `INTRINSICS_EVERY`, at which densification skips steps."""
+    def due_intrinsics(self, step: ViewStep) -> list[int]:
+        """Rows of the intrinsics whose step is due before the step of a view. The view's gradient must be
+        added to the sums of its row afterwards."""
         if not self._settings.refine_intrinsics:
             return []
-        self._unapplied.add(self.rows[view])
-        if (iteration + 1) % INTRINSICS_EVERY:
-            return []
-        due, self._unapplied = sorted(self._unapplied), set()
+        due: list[int] = []
+        # not at multiples of `INTRINSICS_EVERY`, where densification skips the step
+        if step.iteration % INTRINSICS_EVERY == 1:
+            due, self._unapplied = sorted(self._unapplied), set()
+        self._unapplied.add(self.rows[step.view])
         return due
 
     def change_intrinsics(self, row: int, iteration: int) -> None:
@@ -166,6 +178,8 @@ class ViewRefinement:
 
     def exposure_step(self, view: int, iteration: int) -> dict[str, float]:
         """Count a step of an exposure on the device; returns its learning rate and bias corrections."""
+        if not self._settings.fit_exposures:
+            return {"rate": 0.0, "correction1": 1.0, "correction2": 1.0}
         return self._exposure_adam.next_step(view, self._settings.exposure_rate_at(iteration))
 
     def centre_exposures(self) -> None:

@@ -179,7 +179,7 @@ def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch):
     monkeypatch.setattr("fidsplat.train.view_refinement.INTRINSICS_EVERY", 2)
     results = []
     for device in (renderer, fs.Renderer("reference")):
-        settings = {"iterations": 5, "sh_degree": 0} | RATES | ALL
+        settings = {"iterations": 7, "sh_degree": 0} | RATES | ALL
         trainer = Trainer(disturbed, device, start=cloud, **settings)
         trainer.run()
         (intrinsics,) = {camera_intrinsics(view.camera)[2:] for view in trainer.views}
@@ -189,7 +189,7 @@ def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch):
     np.testing.assert_allclose(results[0][0], results[1][0], atol=2e-6)
     np.testing.assert_allclose(results[0][1], results[1][1], atol=2e-6)
     np.testing.assert_allclose(results[0][2], results[1][2], atol=1e-5)
-    assert np.abs(results[0][2] - (33, 36, 16.5, 11.5)).min() > 0.005
+    assert np.abs(results[0][2] - (33, 36, 16.5, 11.5)).min() > 3e-4  # 30 times the tolerance
 
 
 def test_a_resumed_run_is_bit_identical(renderer, cloud, disturbed, tmp_path, monkeypatch):

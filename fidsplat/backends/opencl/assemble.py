@@ -77,11 +77,8 @@ _STEP = (
     *("prelude", "math", "splat", "bounds", "record_gradients", "project_splat_backward"),
     *("train/activation_functions", "train/adam", "project_step"),
 )
-_REFINE = "rigid_motion", "train/view_adam", "train/refine_camera"
-_TRAINING = (
-    *("surface", "view_adam", "exposure", "activation_functions", "activate", "gather_rows"),
-    "position_noise",
-)
+_REFINE = "rigid_motion", "train/view_adam", "train/refine_view"
+_TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
@@ -257,10 +254,10 @@ def assemble_gradients(features: FeatureSet, config: KernelConfig) -> KernelSour
     return _assemble_backward("gradients", _GRADIENTS, features, config)
 
 
-def assemble_step(features: FeatureSet, config: KernelConfig, camera: bool = False) -> KernelSource:
-    """Assemble a training step: the last stage of the backward pass, fused with Adam. camera: also sum the
-    gradient with respect to the camera, and refine cameras."""
-    stages, parts = ((*_STEP, *_REFINE), ("step_camera",)) if camera else (_STEP, ())
+def assemble_step(features: FeatureSet, config: KernelConfig, refined: bool = False) -> KernelSource:
+    """Assemble a training step: the last stage of the backward pass, fused with Adam. refined: also
+    sum the gradient with respect to the camera, and refine views."""
+    stages, parts = ((*_STEP, *_REFINE), ("step_camera",)) if refined else (_STEP, ())
     return _assemble_backward("step", stages, features, config, parts)
 
 

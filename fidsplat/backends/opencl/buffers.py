@@ -7,7 +7,8 @@ import math
 import mmap
 import weakref
 from collections.abc import Collection, Hashable, Iterable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -34,7 +35,8 @@ def token_of(buffer: cl.Buffer) -> object:
     return buffer.token if type(buffer) is DeviceBuffer else object()
 
 
-class DeviceRecord(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class DeviceRecord:
     """A record in a device buffer, for `BufferPool.upload` in place of a host array."""
 
     buffer: cl.Buffer
@@ -53,7 +55,7 @@ class BufferPool:
         """whether the device shares the host's memory"""
         self._buffers: dict[str, cl.Buffer] = {}
         self._arrays: dict[str, Array] = {}
-        self._contents: dict[str, weakref.ref[np.ndarray]] = {}
+        self._contents: dict[str, weakref.ref[np.ndarray | DeviceRecord]] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
         self._zeroed: set[str] = set()
         self._key: Hashable = None
@@ -121,20 +123,23 @@ class BufferPool:
         self, queue: cl.CommandQueue, name: str, array: np.ndarray | DeviceRecord
     ) -> tuple[cl.Buffer, cl.Event | None]:
         """Copy an array to a scratch buffer without waiting; returns the buffer and the event of the copy. A
-        read-only array that the buffer already contains is not copied again."""
-        if isinstance(array, DeviceRecord):
-            buffer = self.scratch(name, array.nbytes)
-            return buffer, cl.enqueue_copy(
-                queue, buffer, array.buffer, src_offset=array.offset, byte_count=array.nbytes
-            )
+        read-only array, or a record, that the buffer already contains is not copied again."""
         content = self._contents.get(name)
         if content is not None and content() is array:
             return self._buffers[name], None
         buffer = self.scratch(name, array.nbytes)
+        if isinstance(array, DeviceRecord):
+            return buffer, cl.enqueue_copy(
+                queue, buffer, array.buffer, byte_count=array.nbytes, src_offset=array.offset
+            )
         event = cl.enqueue_copy(queue, buffer, array, is_blocking=False)
         if not array.flags.writeable and array.flags.owndata:
             self._contents[name] = weakref.ref(array)
         return buffer, event
+
+    def set_contents(self, name: str, record: DeviceRecord) -> None:
+        """Mark a scratch buffer as a copy of a record, which a kernel has made."""
+        self._contents[name] = weakref.ref(record)
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes with undefined contents."""

@@ -26,6 +26,7 @@ from fidsplat.backends.opencl.assemble import (
     backward_items,
     segment_size,
 )
+from fidsplat.backends.opencl.buffers import DeviceRecord
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.images import OpenCLImages
@@ -42,6 +43,7 @@ _GROUP = 64  # work-group size: RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_IT
 _SUMS = {"background": 3, "pose": 6, "intrinsics": 4}
 """gradients that are sums over tiles or splats, and their number of components"""
 _CAMERA = 10  # pose and intrinsics
+_REFINE_ITEMS = 240  # of kernels/opencl/train/refine_view.cl
 _DOING = "taking derivatives"
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # also zeroes floats
@@ -80,7 +82,7 @@ class OpenCLGradients(GradientPipeline):
         """capacity of the tile lists of frames that are submitted without waiting for their counts"""
         self._tile_commands, self.sum_commands = CommandList(self.program), CommandList(self.program)
         self.step_commands: dict[bool, CommandList] = {}
-        """command lists of `TileGradients.step` by `with_camera`"""
+        """command lists of `TileGradients.step`, without and with refinement of views"""
 
     def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """Render one frame. waits: whether to wait for its counts, as the first frame on a GPU must."""
@@ -171,11 +173,11 @@ class OpenCLGradients(GradientPipeline):
         words = 2 * 8 * splats + 1
         return 8 * splats * config.tile_width * config.tile_height + -(-4 * words // vector) * vector
 
-    def compile_step(self, with_camera: bool = False) -> None:
-        """Compile the kernel of `step`, which gradients do not need."""
-        if with_camera not in self.step_commands:
-            source = assemble_step(self.features, self._pipeline.config, with_camera)
-            self.step_commands[with_camera] = CommandList(Program(self._pipeline.workspace, source))
+    def compile_step(self, refined: bool = False) -> None:
+        """Compile the kernels of `step`, which gradients do not need. refined: whether views are refined."""
+        if refined not in self.step_commands:
+            source = assemble_step(self.features, self._pipeline.config, refined)
+            self.step_commands[refined] = CommandList(Program(self._pipeline.workspace, source))
 
     def _check_capacity(self, frame: DeviceFrame) -> None:
         """Raise CapacityExceeded if the lists were too small."""
@@ -231,37 +233,38 @@ class TileGradients:
             self._sum_gradients(frame, results, groups)
             return results
 
-    def step(self, arguments: Mapping[str, Any], with_camera: bool = False) -> None:
+    def step(self, arguments: Mapping[str, Any], next_record: DeviceRecord | None = None) -> None:
         """Submit an optimiser step (kernels/opencl/project_step.cl), compiled by
         `OpenCLGradients.compile_step`.
 
-        arguments: values that the frame does not define. with_camera: whether to sum the gradient with
-        respect to the camera, for `camera_sums`.
+        arguments: values that the frame does not define. next_record: record of the next frame's camera, if
+            views are refined (kernels/opencl/train/refine_view.cl).
         """
         with self._latest_frame():
-            frame, commands = self._frame, self.pipeline.step_commands[with_camera]
-            arguments = {**arguments, "count": (count := frame.resident.count)}
-            if with_camera:
-                self._allocate_camera_sums(frame)
+            refined = next_record is not None
+            frame, commands = self._frame, self.pipeline.step_commands[refined]
+            count = frame.resident.count
+            arguments = {**arguments, "count": count}
+            if refined:
+                arguments["groups"] = self._allocate_camera_sums(frame)
+            declared = commands.program.source.arguments
+            sizes = {"project_step": (max(1, -(-count // _GROUP)) * _GROUP, _GROUP)}
+            sizes |= {"refine_view": (_REFINE_ITEMS, _REFINE_ITEMS)} if refined else {}
             values = {
-                name: arguments[name] if name in arguments else frame.value(declared)
-                for name, declared in commands.program.source.arguments["project_step"].items()
+                name: arguments[name] if name in arguments else frame.value(argument)
+                for kernel in sizes
+                for name, argument in declared[kernel].items()
             }
             if commands.key != count:
                 commands.clear()
-                size = (max(1, -(-count // _GROUP)) * _GROUP,)
-                commands.record("project_step", size, (_GROUP,), list(values.values()))
+                for kernel, (size, group) in sizes.items():
+                    commands.record(kernel, (size,), (group,), [values[name] for name in declared[kernel]])
                 commands.key = count
             commands.set(values)
             frame.events += commands.submit(frame.queue)
-            frame.stages.append("project backward")
-
-    def camera_sums(self) -> dict[str, Any]:
-        """Arguments of the kernel `refine_camera` after `step` with `with_camera`."""
-        return {
-            "groups": -(-self._frame.resident.count // _GROUP),
-            "camera_sums": self._frame.named["camera_sums"],
-        }
+            frame.stages += ["project backward"] * len(sizes)
+            if next_record is not None:
+                frame.pool.set_contents("view", next_record)
 
     @contextmanager
     def _latest_frame(self) -> Iterator[None]:

@@ -117,6 +117,7 @@ _BLEND = args(
     "out float raw  // 4 channels: r, g, b, transmittance",
 )
 
+_EXPOSURES = args("in float exposures  // (views, 6): logarithms of gains, and offsets")
 _VIEW_ADAM = args("real rate beta1 beta2 correction1 correction2  // correction1: 1 - beta1^step")
 _LOSS_SIZE = args(
     "int width height  // width: values of a row, three per pixel",
@@ -132,7 +133,7 @@ _ALIGNED = args(
 _IMAGES = args("out float images")
 _SURFACE = args(
     _IMAGE_SIZE,
-    "uint row  // of the view",
+    "uint view_index",
     "in float lenses  // (views, 4): fx, fy, cx, cy",
 )
 _RENDERED_SH = args(
@@ -268,13 +269,17 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float sh first_sh second_sh",
         "out float activated_quats activated_scales activated_opacities activated_sh",
     ),
-    "refine_camera": args(
-        *("uint groups row intrinsics_row", "int refine_pose", _VIEW_ADAM),
+    "refine_view": args(
+        "uint groups exposure_groups view_index next_view intrinsics_row",
+        *("int refine_pose refine_intrinsics refine_exposure", _VIEW_ADAM),
+        "real exposure_rate exposure_correction1 exposure_correction2",
         "real depth  // [m] of the point about which the camera rotates",
         "in real camera_sums  // (groups, 10)",
-        "out View views",
-        "out real pose_moments  // (views, 2, 6)",
+        "in float exposure_sums  // (exposure_groups, 6)",
+        "out View views view  // records of all views; of the frame",
+        "out real pose_moments exposure_moments  // (views, 2, 6): Adam's moments",
         "out real intrinsics_sums  // (rows, 4)",
+        "out float exposures",
     ),
     "refine_intrinsics": args(
         *("uint count  // views", "uint intrinsics_row", _VIEW_ADAM),
@@ -320,7 +325,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in float totals", "out float fit state", "out real pose view  // pose: the last accepted"),
     ),
     # training
-    "loss_load": args(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK, _IMAGES),
+    "loss_load": args(
+        *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
+        *("int exposed", "uint view_index", _EXPOSURES, _IMAGES),
+    ),
     "loss_rows": args(_LOSS_SIZE, _IMAGES),
     "loss_columns": args(_LOSS_SIZE, _IMAGES),
     "loss_rows_backward": args(_LOSS_SIZE, _IMAGES),
@@ -337,20 +345,13 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("float l1_weight ssim_weight", "in float images", "out float grad_rgb"),
     ),
     "apply_exposure": args(
-        *("uint count  // pixels", "uint row  // of the view"),
-        "in real exposures  // (views, 6): logarithms of gains, and offsets",
-        *("in float rgb", "out float exposed"),
+        *("uint pixels view_index", _EXPOSURES, "in float rendered", "out float rgb"),
     ),
     "exposure_backward": args(
-        *("uint count  // pixels", "uint row  // of the view", "in real exposures", "in float rgb"),
-        "out float grad_rgb",
-        "out real exposure_sums  // (work-groups, 6)",
+        *("uint pixels view_index", _EXPOSURES, "in float rendered", "out float grad_rgb"),
+        "out float exposure_sums  // (work-groups, 6)",
     ),
-    "refine_exposure": args(
-        *("uint groups row", _VIEW_ADAM, "in real exposure_sums"),
-        "out real exposures exposure_moments  // (views, 2, 6): Adam's moments",
-    ),
-    "centre_exposures": args("uint count  // views", "out real exposures"),
+    "centre_exposures": args("uint count  // views", "out float exposures"),
     "surface_normals": args(
         _SURFACE,
         _MASK,

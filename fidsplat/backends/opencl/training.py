@@ -26,10 +26,8 @@ _PANEL, _STRIP = 128, 64
 """values of a row and number of rows per work-item on CPUs (kernels/opencl/train/loss_strips.cl)"""
 _SUM_GROUPS, _SUM_ITEMS = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
-_EXPOSURE_GROUPS = 64
+_EXPOSURE_GROUPS = 256
 """work-groups of the sums for the gradient of the exposure"""
-_REFINE_ITEMS = {"refine_camera": 240, "refine_intrinsics": 64}
-"""work-group sizes of kernels/opencl/train/refine_camera.cl"""
 _ROWS_PER_ITEM = 4
 """rows per work-item of the vertical passes (ROWS_PER_ITEM of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
@@ -155,6 +153,7 @@ class OpenCLTraining:
         """Copy the images to the device: (h, w, 3) uint8 each, with a mask (h, w) bool or None. intrinsics:
         (views, 4) fx, fy, cx, cy."""
         self._bound["lenses"] = self._upload("intrinsics", intrinsics.astype(np.float32))
+        self._bound["exposures"] = self._bound["lenses"]  # read only if there are exposures
         for image, mask in views:
             weights = np.zeros(1, np.uint8) if mask is None else mask.astype(np.uint8)
             values = image.size if mask is None else max(1, 3 * int(weights.sum()))
@@ -255,12 +254,10 @@ class OpenCLTraining:
         until the next call.
         """
         rgb, (height, columns, _) = images.device_buffer("rgb")
-        exposure: dict[str, Any] = {}
-        if exposed:
-            exposure = {"row": view, "count": height * columns, "rgb": rgb}
-            rgb = self._scratch("exposed", 12 * height * columns)
-            self._replay_exposure("apply_exposure", {**exposure, "exposed": rgb})
         target, size, in_strips = self._targets[view], 3 * height * columns, self._lanes > 1
+        exposure = {"exposed": int(exposed), "view_index": view, "rendered": rgb, "pixels": height * columns}
+        if exposed and in_strips:
+            rgb = self._scratch("exposed", 12 * height * columns)
         value_count, stride = target.values, self._stride(columns)
         grid = (-(-3 * columns // _PANEL), -(-height // _STRIP)) if in_strips else (_SUM_GROUPS,)
         if (groups := math.prod(grid)) not in self._readbacks:
@@ -271,7 +268,10 @@ class OpenCLTraining:
         args = {
             **{"rgb": rgb, "target": target.image, "mask": target.mask, "masked": int(target.masked)},
             **{"l1_weight": (1 - dssim_weight) / value_count, "sums": buffer, "grad_rgb": gradient.data},
+            **exposure,
         }
+        if exposed:
+            args["exposure_sums"] = self._exposure_sums()
 
         def loss_launches() -> list[Launch]:
             values = args | {
@@ -280,23 +280,22 @@ class OpenCLTraining:
                 **{"images": self._allocate_images(height, columns)},
                 "image_stride": stride * (height + 2 * _MARGIN_ROWS),
             }
+            exposures = (_EXPOSURE_GROUPS * _GROUP,), (_GROUP,), values
+            backward = [self._launch_of("exposure_backward", *exposures)] if exposed else []
             if in_strips:
                 kernels = "loss_strips", "loss_strips_backward"
-                return [self._launch_of(kernel, grid, (1, 1), values) for kernel in kernels]
+                strips = [self._launch_of(kernel, grid, (1, 1), values) for kernel in kernels]
+                applied = [self._launch_of("apply_exposure", *exposures)] if exposed else []
+                return [*applied, *strips, *backward]
             launches = [self._row_launch("loss_load", 3 * columns, values, height)]
             for kernel in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
                 rows = -(-height // _ROWS_PER_ITEM) if "columns" in kernel else height
                 launches.append(self._row_launch(kernel, 3 * columns, values, rows))
             items = (_SUM_GROUPS * _SUM_ITEMS,)
-            return [*launches, self._launch_of("loss_sums", items, (_SUM_ITEMS,), values)]
+            return [*launches, *backward, self._launch_of("loss_sums", items, (_SUM_ITEMS,), values)]
 
-        events = self._replay("loss", (height, columns, dssim_weight), args, loss_launches)
-        readback.submitted(slot, events[0 if in_strips else -1])
-
-        if exposed:
-            sums = self._scratch("exposure sums", 48 * _EXPOSURE_GROUPS)
-            args = {**exposure, "grad_rgb": gradient.data, "exposure_sums": sums}
-            self._replay_exposure("exposure_backward", args)
+        events = self._replay("loss", (height, columns, dssim_weight, exposed), args, loss_launches)
+        readback.submitted(slot, events[int(exposed) if in_strips else -1])
 
         def value() -> tuple[float, float]:
             self._queue.flush()
@@ -307,10 +306,9 @@ class OpenCLTraining:
 
         return value, gradient
 
-    def _replay_exposure(self, kernel: str, args: Mapping[str, Any], groups: int = _EXPOSURE_GROUPS) -> None:
-        """Submit a kernel of kernels/opencl/train/exposure.cl."""
-        size = (groups * _GROUP,)
-        self._replay(kernel, (), args, lambda: [self._launch_of(kernel, size, (_GROUP,), args)])
+    def _exposure_sums(self) -> cl.Buffer:
+        """Sums of the kernel `exposure_backward`."""
+        return self._scratch("exposure sums", 24 * _EXPOSURE_GROUPS)
 
     def normal_loss_gradients(self, images: Any, view: int, weight: float) -> dict[str, Any]:
         """Gradients of `train.losses.normal_loss` with respect to `depth` and `normal`, times the weight;
@@ -321,7 +319,7 @@ class OpenCLTraining:
         results = {name: self._array(f"grad {name}", shape) for name, shape in shapes.items()}
         args = {
             **{"width": width, "height": height, "mask": target.mask, "masked": int(target.masked)},
-            "row": view,
+            "view_index": view,
             **{name: images.device_array(name).data for name in ("depth", "normal", "alpha")},
             **{f"grad_{name}": array.data for name, array in results.items()},
             "normal_weight": weight / (width * height),
@@ -334,7 +332,9 @@ class OpenCLTraining:
     def accumulate_statistics(self, gradients: Any) -> None:
         """Add a frame's `grad2d` and visibility to the statistics. gradients: result of
         `backward_per_tile`."""
-        self._step(gradients, dict.fromkeys(_STEP_NUMBERS, 0.0) | {"update": 0, "sparse": 0}, True, False)
+        args = dict.fromkeys(_STEP_NUMBERS, 0.0) | {"update": 0, "sparse": 0, "add_statistics": 1}
+        gradients.pipeline.compile_step()
+        gradients.step(self._bound | args)
 
     def step(
         self,
@@ -342,7 +342,7 @@ class OpenCLTraining:
         learning_rates: Mapping[str, float],
         hyperparameters: Mapping[str, float],
         statistics: bool,
-        with_camera: bool = False,
+        view_step: Mapping[str, Any] | None = None,
     ) -> None:
         """Apply a step of Adam.
 
@@ -353,28 +353,29 @@ class OpenCLTraining:
                 `scale_penalty` and `opacity_penalty`, added to the gradients; `sparse`: 1 to update only
                 splats that contribute to the frame.
             statistics: whether statistics are accumulated first.
-            with_camera: whether `refine_camera` follows.
+            view_step: numbers of the kernel `refine_view`; None: the view is not refined.
         """
         args = {f"lr_{name}": rate for name, rate in learning_rates.items()} | dict(hyperparameters)
         args |= {
             "one_minus_beta1": 1 - hyperparameters["beta1"],
             "one_minus_beta2": 1 - hyperparameters["beta2"],
         }
-        args |= {"update": 1, "sparse": int(hyperparameters["sparse"])}
-        self._step(gradients, args, statistics, with_camera)
-
-    def _step(self, gradients: Any, args: Mapping[str, Any], statistics: bool, with_camera: bool) -> None:
+        args |= {"update": 1, "sparse": int(hyperparameters["sparse"]), "add_statistics": int(statistics)}
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
-        gradients.pipeline.compile_step(with_camera)
-        gradients.step({**self._bound, **args, "add_statistics": int(statistics)}, with_camera)
+        gradients.pipeline.compile_step(view_step is not None)
+        if view_step is None or self._refinement is None:
+            gradients.step(self._bound | args)
+            return
+        args |= {"exposure_groups": _EXPOSURE_GROUPS, "exposure_sums": self._exposure_sums()}
+        next_record = self._refinement.device_records[view_step["next_view"]]
+        gradients.step({**self._bound, **args, **view_step}, next_record)
 
     def load_refinement(
         self, arrays: Mapping[str, np.ndarray], views: Sequence[View], rows: Sequence[int]
     ) -> None:
         """Copy the state of `ViewRefinement` to the device. views: uniforms of the training views. rows: row
         of `intrinsics` of each view."""
-        real = self._program.source.scalars.dtype("real")
-        self._refinement = OpenCLViewRefinement(self._workspace, real, arrays, views, rows, self._bound)
+        self._refinement = OpenCLViewRefinement(self._workspace, arrays, views, rows, self._bound)
 
     def read_refinement(self) -> dict[str, np.ndarray]:
         """Copy the state of `ViewRefinement` to the host; waits for the device."""
@@ -387,24 +388,11 @@ class OpenCLTraining:
         assert self._refinement is not None
         return self._refinement.refined(view, number, pipeline.source.records["View"])
 
-    def refine_camera(self, gradients: Any, args: Mapping[str, Any]) -> None:
-        """Apply a step of Adam to the camera of a frame, after `step` with its gradients."""
-        self._refine("refine_camera", gradients, {**args, **gradients.camera_sums()})
-
     def refine_intrinsics(self, gradients: Any, args: Mapping[str, Any], views: int) -> None:
-        """Apply a step of Adam to a row of the intrinsics."""
-        self._refine("refine_intrinsics", gradients, {**args, "count": views})
-
-    def _refine(self, kernel: str, gradients: Any, args: Mapping[str, Any]) -> None:
-        """Submit a kernel of kernels/opencl/train/refine_camera.cl, which `step` has compiled."""
-        program, size = gradients.pipeline.step_commands[True].program, (_REFINE_ITEMS[kernel],)
+        """Apply a step of Adam to a row of the intrinsics, between two steps."""
+        program, size = gradients.pipeline.step_commands[True].program, (_GROUP,)
+        kernel, args = "refine_intrinsics", {**args, "count": views}
         self._replay(kernel, (), args, lambda: [self._launch_of(kernel, size, size, args, program)], program)
-
-    def refine_exposure(self, args: Mapping[str, Any]) -> None:
-        """Apply a step of Adam to the exposure of a view, after its `loss`."""
-        sums = self._scratch("exposure sums", 48 * _EXPOSURE_GROUPS)
-        args = {**args, "groups": _EXPOSURE_GROUPS, "exposure_sums": sums}
-        self._replay_exposure("refine_exposure", args, 1)
 
     def centre_exposures(self, views: int) -> None:
         """Set the means of the exposures over the views to 0."""

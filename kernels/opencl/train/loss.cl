@@ -9,8 +9,8 @@
     if (column >= width || row >= height) return; \
     size_t at = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column
 
-// Index space: one work-item per value of the image. Reads: the render, the target, the mask. Writes: images 0 and 1 of `images`.
-// Where the mask is 0 the render is replaced by the target.
+// Index space: one work-item per value of the image. Reads: the render, to which an exposure is applied if `exposed`, the target, the mask. Writes: images
+// 0 and 1 of `images`. Where the mask is 0 the render is replaced by the target.
 kernel void loss_load(
 //@@ arguments loss_load
 ) {
@@ -19,7 +19,9 @@ kernel void loss_load(
     size_t from = (size_t)row * width + column, to = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column;
     float target_value = target[from] * (1.0f / 255);
     bool counts = !masked || mask[(size_t)row * (width / 3) + column / 3];
-    images[to] = counts ? rgb[from] : target_value;
+    float value = rgb[from];
+    if (exposed) value = exp(exposures[6 * view_index + column % 3]) * value + exposures[6 * view_index + 3 + column % 3];
+    images[to] = counts ? value : target_value;
     images[image_stride + to] = target_value;
 }
 

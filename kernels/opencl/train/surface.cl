@@ -8,7 +8,7 @@ static inline float3 ray_at(int x, int y, global const float *lens) {
 }
 
 // Unprojected point of a pixel.
-#define POINT(x, y) (ray_at(x, y, lenses + 4 * row) * depth[(y) * (size_t)width + (x)])
+#define POINT(x, y) (ray_at(x, y, lenses + 4 * view_index) * depth[(y) * (size_t)width + (x)])
 #define HAS_DEPTH(x, y) (depth[(y) * (size_t)width + (x)] > 0.0f)
 
 // Index space: (columns, rows). Reads: the images, the mask. Writes: the gradients with respect to normals and, for each pixel, the
@@ -52,6 +52,6 @@ kernel void surface_depths(
     if (y + 1 < height) by -= vload3(2 * (at + width), differences);
     if (x > 0) by += vload3(2 * (at - 1) + 1, differences);
     if (x + 1 < width) by -= vload3(2 * (at + 1) + 1, differences);
-    float3 ray = ray_at(x, y, lenses + 4 * row);
+    float3 ray = ray_at(x, y, lenses + 4 * view_index);
     grad_depth[at] = ray.x * by.x + ray.y * by.y + by.z;
 }
