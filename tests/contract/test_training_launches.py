@@ -19,6 +19,7 @@ from fidsplat.train.losses import Loss
 
 BACKEND = "opencl"
 STEADY = {**QUICK, "iterations": 40, "densify_from": 99, "sh_degree": 1}
+REFINED = {"refine_poses": True, "refine_intrinsics": True, "fit_exposures": True}
 
 
 @pytest.fixture
@@ -41,17 +42,27 @@ def splats_of(trainer):
     return {name: array.tobytes() for name, array in trainer._model.read().values.items()}
 
 
-def test_replayed_steps_are_bit_identical(on_groups, dataset, monkeypatch):
+def views_of(trainer):
+    """Refined poses, intrinsics and exposures."""
+    cameras = [view.camera for view in trainer.views]
+    poses = [camera.world_to_camera.tobytes() for camera in cameras]
+    intrinsics = [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]
+    return poses, intrinsics, trainer.exposures.tobytes()
+
+
+@pytest.mark.parametrize("refined", [{}, REFINED])
+def test_replayed_steps_are_bit_identical(on_groups, dataset, monkeypatch, refined):
     """Also after frames of another kind, and after their buffers are released."""
-    again, planned = (Trainer(dataset, on_groups, **STEADY) for _ in range(2))
-    launched = []
+    again, planned = (Trainer(dataset, on_groups, **STEADY, **refined) for _ in range(2))
+    launched, unrefined = [], views_of(again)
     for _ in range(8):
         again.step()
     record = CommandList.record
     monkeypatch.setattr(CommandList, "record", lambda *given: launched.append(given[1]) or record(*given))
     for _ in range(6):  # not to iteration 16, where the degree grows
         again.step()
-    assert not launched
+    assert {*launched} <= {"refine_intrinsics"}  # first at iteration 11
+    launched.clear()
     again.evaluate()
     on_groups.backend.release_scratch()
     assert launched
@@ -59,12 +70,14 @@ def test_replayed_steps_are_bit_identical(on_groups, dataset, monkeypatch):
         again.step()
     launched.clear()
     again.step()
-    assert not launched
+    assert not {*launched} - {"refine_intrinsics"}
     again.run()
     never_replay(monkeypatch)
     monkeypatch.setattr(CommandList, "set", set_all)
     planned.run()
     assert splats_of(again) == splats_of(planned)
+    assert views_of(again) == views_of(planned)
+    assert all(a != b for a, b in zip(views_of(again), unrefined, strict=True)) == bool(refined)
     for name, array in planned.history.items():
         np.testing.assert_array_equal(again.history[name], array)
 
@@ -115,9 +128,10 @@ def test_a_replayed_frame_that_exceeds_its_capacity_is_rendered_again(on_groups,
     assert losses[0] == losses[1]
 
 
-def test_steps_are_the_same_if_they_are_reported_later(renderer, dataset):
+@pytest.mark.parametrize("refined", [{}, REFINED])
+def test_steps_are_the_same_if_they_are_reported_later(renderer, dataset, refined):
     """At the end of a run all are reported, in their order."""
-    settings = {**QUICK, "iterations": 40}
+    settings = {**QUICK, **refined, "iterations": 40}
     prompt, late, at_once = (Trainer(dataset, renderer, **settings) for _ in range(3))
     reported, ahead = [], []
     prompt.run(lambda step: ahead.append(prompt.iteration - step.iteration))
@@ -126,6 +140,19 @@ def test_steps_are_the_same_if_they_are_reported_later(renderer, dataset):
     assert reported == steps
     assert set(ahead) == {0}
     assert splats_of(prompt) == splats_of(late) == splats_of(at_once)
+    assert views_of(prompt) == views_of(late) == views_of(at_once)
+
+
+def test_a_step_reads_no_refined_camera(renderer, dataset, monkeypatch):
+    """Only a report reads them from the device, which a step would wait for."""
+    trainer = Trainer(dataset, renderer, **STEADY, **REFINED)
+    read, reads = trainer._model.read_refinement, []
+    monkeypatch.setattr(trainer._model, "read_refinement", lambda: reads.append(trainer.iteration) or read())
+    for _ in range(12):
+        trainer.step()
+    assert not reads
+    trainer.pose_changes()
+    assert reads == [12]
 
 
 def test_a_late_loss_that_is_not_finite_has_its_iteration_and_keeps_the_checkpoint(

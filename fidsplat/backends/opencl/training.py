@@ -270,8 +270,6 @@ class OpenCLTraining:
             **{"l1_weight": (1 - dssim_weight) / value_count, "sums": buffer, "grad_rgb": gradient.data},
             **exposure,
         }
-        if exposed:
-            args["exposure_sums"] = self._exposure_sums()
 
         def loss_launches() -> list[Launch]:
             values = args | {
@@ -305,10 +303,6 @@ class OpenCLTraining:
             return float(loss), float(squared / value_count)
 
         return value, gradient
-
-    def _exposure_sums(self) -> cl.Buffer:
-        """Sums of the kernel `exposure_backward`."""
-        return self._scratch("exposure sums", 24 * _EXPOSURE_GROUPS)
 
     def normal_loss_gradients(self, images: Any, view: int, weight: float) -> dict[str, Any]:
         """Gradients of `train.losses.normal_loss` with respect to `depth` and `normal`, times the weight;
@@ -366,7 +360,6 @@ class OpenCLTraining:
         if view_step is None or self._refinement is None:
             gradients.step(self._bound | args)
             return
-        args |= {"exposure_groups": _EXPOSURE_GROUPS, "exposure_sums": self._exposure_sums()}
         next_record = self._refinement.device_records[view_step["next_view"]]
         gradients.step({**self._bound, **args, **view_step}, next_record)
 
@@ -376,6 +369,9 @@ class OpenCLTraining:
         """Copy the state of `ViewRefinement` to the device. views: uniforms of the training views. rows: row
         of `intrinsics` of each view."""
         self._refinement = OpenCLViewRefinement(self._workspace, arrays, views, rows, self._bound)
+        size = 24 * _EXPOSURE_GROUPS
+        self._bound["exposure_sums"] = self._workspace.pool.allocate("the exposures' sums", size)
+        self._bound["exposure_groups"] = _EXPOSURE_GROUPS
 
     def read_refinement(self) -> dict[str, np.ndarray]:
         """Copy the state of `ViewRefinement` to the host; waits for the device."""
@@ -396,7 +392,8 @@ class OpenCLTraining:
 
     def centre_exposures(self, views: int) -> None:
         """Set the means of the exposures over the views to 0."""
-        self._enqueue(self._launch_of("centre_exposures", (6,), (6,), {"count": views}))
+        kernel, args = "centre_exposures", {"count": views}
+        self._replay(kernel, (), args, lambda: [self._launch_of(kernel, (6,), (6,), args)])
 
     def add_noise(self, size: float, slope: float, threshold: float, words: Sequence[int]) -> None:
         """Add MCMC noise to the means: steps size * sigmoid(slope (threshold - opacity)) * covariance *
