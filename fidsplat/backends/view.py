@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,8 @@ class View:
     device_record: Any = None
     """uniforms of the projection in device memory (`opencl.buffers.DeviceRecord`), used instead of those of
     this view; None: there are none"""
+    kernel_arguments: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """cache of the backends: the view's kernel arguments, by the kernels that receive them"""
 
     @property
     def lens(self) -> Lens | None:
@@ -147,11 +149,15 @@ class View:
         """An array of an effect by its name: int32 for labels, else float32."""
         if self.external_depth is not None and name.startswith("external_"):
             return getattr(self.external_depth, name.removeprefix("external_"))
-        if name == "row_rotations":
-            return self.row_rotations.astype(np.float32)
-        if name == "panorama" and isinstance(self.environment_map, Panorama):
-            return self.environment_map.image
-        return np.asarray(self.sensor.response, np.float32)
+        match name:
+            case "row_rotations":
+                return self.row_rotations.astype(np.float32)
+            case "panorama" if isinstance(self.environment_map, Panorama):
+                return self.environment_map.image
+            case "response":
+                return np.asarray(self.sensor.response, np.float32)
+            case _:
+                raise KeyError(name)
 
     @classmethod
     def of(cls, capture: Capture, origin: np.ndarray, camera: Camera | None = None) -> View:

@@ -48,7 +48,7 @@ class Source(SceneInput):
             shape = cpu_config() if self.schedule == "lanes" else gpu_config()
             source = assemble(features, config_for(features, shape))
         else:
-            source = self._backend().source(features)
+            source = self._backend().pipeline(features).source
         sys.stdout.write(source.listing)
         return 0
 

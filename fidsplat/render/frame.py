@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.backends.interface import HostImages, Images
+from fidsplat.backends.interface import HostImages, Images, Pipeline
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import CaptureBatch
 from fidsplat.render.array_export import ImageMapping, SceneIndices, check_process, with_scene_indices
@@ -173,7 +173,7 @@ def _host_batch(
     return FrameBatch(HostImages(arrays, timings, stats), views)
 
 
-def stack_bands(bands: Iterable[BandData], render: Callable[[BandData], Frame]) -> Frame:
+def stack_bands(bands: Iterable[BandData], pipeline: Pipeline, capture: Capture) -> Frame:
     """Render bands of rows and stack them to one frame.
 
     The device stores the splats of one band at a time. Each band is copied to the host while the next is
@@ -198,7 +198,8 @@ def stack_bands(bands: Iterable[BandData], render: Callable[[BandData], Frame]) 
     for band in bands:
         if previous is not None:
             finish(previous[0])
-        frame = render(band)
+        images = band.images or pipeline.render_view(band.data, band.view)
+        frame = Frame(images, capture, band.scene_indices)
         if previous is not None:
             copy_rows(*previous)
         previous = frame, band.rows
@@ -207,4 +208,4 @@ def stack_bands(bands: Iterable[BandData], render: Callable[[BandData], Frame]) 
         return previous[0]
     finish(previous[0])
     copy_rows(*previous)
-    return _host_frame(arrays, timings, stats, previous[0].capture)
+    return _host_frame(arrays, timings, stats, capture)

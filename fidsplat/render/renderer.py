@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from fidsplat.backends.interface import DeviceInfo, Images, Pipeline
+from fidsplat.backends.interface import DeviceInfo, Images
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import AUTO, open_backend
 from fidsplat.backends.view import NO_CAMERA, View
@@ -32,7 +32,6 @@ from fidsplat.scenes import Scene
 from fidsplat.splats.cloud import SplatCloud
 from fidsplat.store.chunked_splats import ChunkedSplats
 from fidsplat.store.store import Store
-from fidsplat.streaming.bands import BandData
 from fidsplat.streaming.device_chunk_cache import DeviceChunkCache, double_buffered
 from fidsplat.util import interrupts
 from fidsplat.util.arguments import invalid, whole_number
@@ -418,35 +417,27 @@ class Renderer:
     ) -> Frame:
         """Render one frame. band: rows of pixels [first, end); None: all."""
         interrupts.check()
-        capture = self._metered(resident, capture)
+        capture, data = self._metered(resident, capture), resident.data
         features, view = prepare(resident.all_splats, capture)
+        passes, reference = [(features, view)], None
+        if "error" in capture.outputs:
+            reference = error_reference(data, capture, self.backend)
+            passes.append((reference.features, reference.view))
         if band is not None:
-            view = _restricted(view, band)
-        with_error = "error" in capture.outputs
-        reference = error_reference(resident.data, capture, self.backend) if with_error else None
+            passes = [(features, _restricted(view, band)) for features, view in passes]
+        images: list[Images] = []
         with self._lock:  # scratch buffers and kernel arguments belong to one frame at a time
-            config, data = self.backend.frame_config(view), resident.data
-            pipeline = self.backend.pipeline(features, config)
-            if not isinstance(data, DeviceChunkCache):
-                images = _images_of(pipeline, data, view, subsampling)
-                if reference is None:
-                    return Frame(images, capture)
-                view = reference.view if band is None else _restricted(reference.view, band)
-                pipeline = self.backend.pipeline(reference.features, config)
-                reference_images = _images_of(pipeline, data, view, subsampling)
-                return Frame(images, capture, error=ErrorImage(images, reference_images, reference))
-
-            def render_band(band: BandData) -> Frame:
-                images = band.images or _images_of(pipeline, band.data, band.view, subsampling)
-                return Frame(images, capture, band.scene_indices)
-
-            return stack_bands(data.bands(view, features, capture.quality, pipeline), render_band)
-
-
-def _images_of(pipeline: Pipeline, data: Any, view: View, subsampling: Subsampling) -> Images:
-    if subsampling is None:
-        return pipeline.render_view(data, view)
-    return pipeline.render_subsampled(data, view, *subsampling)
+            for features, view in passes:
+                pipeline = self.backend.pipeline(features, self.backend.frame_config(view))
+                if isinstance(data, DeviceChunkCache):
+                    bands = data.bands(view, features, capture.quality, pipeline)
+                    return stack_bands(bands, pipeline, capture)
+                if subsampling is None:
+                    images.append(pipeline.render_view(data, view))
+                else:
+                    images.append(pipeline.render_subsampled(data, view, *subsampling))
+        error = None if reference is None else ErrorImage(images[0], images[1], reference)
+        return Frame(images[0], capture, error=error)
 
 
 def _restricted(view: View, band: tuple[int, int]) -> View:

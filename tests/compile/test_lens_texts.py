@@ -65,7 +65,7 @@ def test_values_without_effect_select_nothing(renderer):
     renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure_time=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
     assert not any(
-        "shutter" in effect or "motion" in effect for features, _ in added for effect in features.effects
+        "shutter" in effect or "motion" in effect for features, *_ in added for effect in features.effects
     )
 
 

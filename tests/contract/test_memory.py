@@ -114,19 +114,15 @@ def test_nothing_is_written_beyond_the_capacity_of_lists(opencl, monkeypatch, ma
     pairs, pool, queue = expected.stats["pairs"], renderer.backend.pool, renderer.backend.queue
     words = {"lists": pairs}
     if machine is as_on_a_gpu:
-        words, capacity, bands = (
-            {"pairs": 200, "lists": 100},
-            tiling.pair_capacity,
-            tiling.unsorted_tile_ranges,
-        )
+        words, capacity, split = {"pairs": 200, "lists": 100}, tiling.pair_capacity, tiling.tile_ranges
 
         def first_looked_at(*given):
             look()
             monkeypatch.setattr(tiling, "pair_capacity", capacity)
-            return bands(*given)
+            return split(*given)
 
         monkeypatch.setattr(tiling, "pair_capacity", lambda workspace, config: 100)
-        monkeypatch.setattr(tiling, "unsorted_tile_ranges", first_looked_at)
+        monkeypatch.setattr(tiling, "tile_ranges", first_looked_at)
     collected = []
 
     def look():

@@ -52,7 +52,7 @@ def test_a_frame_is_replayed_for_each_view(opencl):
         for k, x in enumerate(places)
     ]
     first_frame = [machine.render(resident, capture) for _ in range(3) for capture in captures]
-    assert [each.recorded is not None for each in resident.data.cached_frames.values()] == [True, True]
+    assert [each.generation is not None for each in resident.data.cached_frames.values()] == [True, True]
     for frame, capture in zip(first_frame, captures * 3, strict=True):
         expected = renderer.render(some, capture)
         assert all(np.array_equal(frame[name], expected[name]) for name in frame)
@@ -68,11 +68,11 @@ def test_counts_of_another_kind_of_frame_are_ignored(opencl):
     resident = machine.upload(random_splats(300, seed=4))
     first, *_ = (machine.render(resident, CAMERA)["rgb"] for _ in range(3))
     (frame,) = resident.data.cached_frames.values()
-    known, state = frame.recorded, machine.backend.pool.generation
+    launches, state = frame.commands._commands, machine.backend.pool.generation
     machine.render(resident, fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)))
     assert np.array_equal(machine.render(resident, CAMERA)["rgb"], first)
-    assert (frame.recorded, machine.backend.pool.generation) == (known, state)
-    assert known is not None
+    assert frame.commands._commands is launches, "replayed"
+    assert machine.backend.pool.generation is state
 
 
 def test_a_replay_on_a_cpu_enlarges_its_lists(opencl):
@@ -87,12 +87,25 @@ def test_a_replay_on_a_cpu_enlarges_its_lists(opencl):
     frames = [machine.render(resident, camera) for camera in cameras]
     assert machine.backend.frames - begun == len(cameras)
     (cached,) = resident.data.cached_frames.values()
-    assert cached.recorded.generation is machine.backend.pool.generation
-    assert cached.recorded.capacity.pairs > 1.2 * frames[0].stats["pairs"], "lists were enlarged"
+    assert cached.generation is machine.backend.pool.generation
+    assert cached.capacity.pairs > 1.2 * frames[0].stats["pairs"], "lists were enlarged"
     for frame, camera in zip(frames, cameras, strict=True):
         expected = renderer.render(some, camera)
         assert np.array_equal(frame["rgb"], expected["rgb"])
         assert frame.stats == expected.stats
+
+
+def test_a_frame_in_ranges_of_tiles_is_not_replayed(opencl):
+    """Its lists exceed the pair budget, so a replay would project and count the splats for nothing."""
+    machine, some = fs.Renderer(opencl.device.name), random_splats(2000, seed=4)
+    expected = machine.render(some, CAMERA)
+    backend = machine.backend
+    backend.pair_budget = expected.stats["pairs"] // 3
+    resident, begun = machine.upload(some), backend.frames
+    frames = [machine.render(resident, CAMERA) for _ in range(4)]
+    assert all(np.array_equal(frame["rgb"], expected["rgb"]) for frame in frames)
+    assert backend.frames - begun == len(frames)
+    assert not resident.data.cached_frames
 
 
 @pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])

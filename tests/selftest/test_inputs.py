@@ -47,8 +47,8 @@ def test_list_offsets_wrap_at_2_to_the_32(renderer, monkeypatch, budget):
         result = original(frame, *args)
         starts = frame.read("starts", np.uint32, (frame.tiles + 1,))
         starts += np.uint32(-(int(starts[-1]) // 2) % 2**32)
-        frame.bind("starts", probe.buffer_of(backend, starts))
-        frame.bind("cursors", probe.buffer_of(backend, starts[:-1]))
+        frame.named["starts"] = probe.buffer_of(backend, starts)
+        frame.named["cursors"] = probe.buffer_of(backend, starts[:-1])
         return result
 
     monkeypatch.setattr(tiling, stage, moved)

@@ -104,7 +104,7 @@ class ProgramSource:
     """without comments, as compiled; lines have the same numbers"""
 
 
-@dataclass
+@dataclass(eq=False)
 class KernelSource:
     """Sources of programs, with their declarations for the host."""
 

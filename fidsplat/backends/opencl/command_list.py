@@ -42,16 +42,6 @@ class Command:
         self._bound[index] = identity
 
 
-class _NamedArgument:
-    """The positions of one argument in all commands, and its last value."""
-
-    __slots__ = ("identity", "positions")
-
-    def __init__(self, positions: list[tuple[Command, int]]) -> None:
-        self.positions = positions
-        self.identity: object = _UNKNOWN
-
-
 class CommandList:
     """Kernel launches of one program, in order.
 
@@ -67,22 +57,20 @@ class CommandList:
         self._reusable: dict[str, list[Command]] = {}
         self._launch_counts: dict[str, int] = {}
         """number of launches of each kernel in this recording"""
-        self._named: dict[str, _NamedArgument] = {}
+        self._positions: dict[str, list[tuple[Command, int]]] = {}
+        """result of `positions` by the argument's name"""
         self.key: Any = None
         """key for which the recording is valid, set by its owner; `clear` resets it"""
 
     @property
     def stages(self) -> list[str]:
+        """Stage of each launch."""
         return [command.stage for command in self._commands]
-
-    @property
-    def kernels(self) -> list[str]:
-        return [command.name for command in self._commands]
 
     def clear(self) -> None:
         """Remove all commands, so that other launches can be appended."""
         self.key = None
-        self._commands, self._launch_counts, self._named = [], {}, {}
+        self._commands, self._launch_counts, self._positions = [], {}, {}
 
     def record(
         self,
@@ -104,8 +92,7 @@ class CommandList:
             command.bind(index, value)
         self._launch_counts[kernel] = number + 1
         self._commands.append(command)
-        if self._named:
-            self._named = {}
+        self._positions = {}
         return command
 
     def launch(
@@ -123,18 +110,11 @@ class CommandList:
     def set(self, values: Mapping[str, Any]) -> None:
         """Change arguments by name, in all commands that have one of that name."""
         for name, value in values.items():
-            argument = self._named.get(name)
-            if argument is None:
-                argument = self._named[name] = _NamedArgument(self.positions(name))
-            identity = token_of(value) if isinstance(value, cl.Buffer) else value
-            if identity is argument.identity or (
-                type(identity) is type(argument.identity) and identity == argument.identity
-            ):
-                continue
-            argument.identity = _UNKNOWN
-            for command, index in argument.positions:
+            positions = self._positions.get(name)
+            if positions is None:
+                positions = self._positions[name] = self.positions(name)
+            for command, index in positions:
                 command.bind(index, value)
-            argument.identity = identity
 
     def submit(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
         """Enqueue the commands [first, end) in order; by default all."""

@@ -33,8 +33,9 @@ class Counts:
     @staticmethod
     def of_counters(words: np.ndarray) -> Counts:
         """Counts of a frame from the buffer `counters` (views, COUNTERS); `big` of the first view only."""
-        pairs = int(words[0, PAIRS]) | int(words[0, PAIRS + 1]) << 32
-        return Counts(int(words[0, BIG]), pairs, int(words[:, VISIBLE].sum(dtype=np.int64)))
+        first, *others = words.tolist()
+        visible = first[VISIBLE] + sum(view[VISIBLE] for view in others)
+        return Counts(first[BIG], first[PAIRS] | first[PAIRS + 1] << 32, visible)
 
     def stats(self, splats: int) -> dict[str, int]:
         return {"splats": splats, "visible": self.visible, "pairs": self.pairs}

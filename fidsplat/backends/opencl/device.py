@@ -13,7 +13,6 @@ from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.interface import Backend, DeviceInfo, Rates
 from fidsplat.backends.opencl.alignment import OpenCLAlignment
-from fidsplat.backends.opencl.assemble import KernelSource, assemble
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
@@ -98,15 +97,11 @@ class OpenCLBackend(Workspace, Backend):
             check_once(user_cache() / "pyopencl", _PYOPENCL_FILES.__contains__, lambda _: True)
         super().__init__(device, _describe(device, _name_of(device)), _config(device))
         self.compiler_options = build_options(device)
-        self._pipelines: dict[tuple[FeatureSet, KernelConfig], OpenCLPipeline] = {}
+        self._pipelines: dict[tuple[FeatureSet, KernelConfig | None, KernelConfig], OpenCLPipeline] = {}
+        """pipelines by the arguments of `pipeline`, and the device's config, which tests replace"""
         self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
         self._alignment: OpenCLAlignment | None = None
         self._background = BackgroundCompiler()
-        self._requested: tuple[KernelConfig, dict[tuple[FeatureSet, KernelConfig | None], OpenCLPipeline]] = (
-            self.config,
-            {},
-        )
-        """the device's own config, and pipelines by the arguments of `pipeline`"""
 
     def upload(self, cloud: SplatCloud) -> UploadedCloud:
         return UploadedCloud(self, cloud)
@@ -129,24 +124,23 @@ class OpenCLBackend(Workspace, Backend):
         )
 
     def pipeline(self, features: FeatureSet, config: KernelConfig | None = None) -> OpenCLPipeline:
-        if self._requested[0] is not self.config:
-            self._requested = self.config, {}
-        cached = self._requested[1].get((features, config))
-        if cached is not None:
-            return cached
+        key = features, config, self.config
+        pipeline = self._pipelines.get(key)
+        if pipeline is not None:
+            return pipeline
         if why := self.unsupported(features):
             raise DeviceError(why)
-        key = self._key(features, config)
-        if key[1].blend_items > self.device.max_work_group_size:
+        if not self.info.float64 and features.projection_precision != "float32":
+            features = replace(features, projection_precision="float32")
+        config = config or config_for(features, self.config)
+        if config.blend_items > self.device.max_work_group_size:
             raise DeviceError(
                 f"a tile must have at most {self.device.max_work_group_size} work-items on "
-                f"{self.info.title}, got {key[1].blend_items} for {key[1].tile_width} x "
-                f"{key[1].tile_height} samples; use another device"
+                f"{self.info.title}, got {config.blend_items} for {config.tile_width} x "
+                f"{config.tile_height} samples; use another device"
             )
-        if key not in self._pipelines:
-            self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
-        self._requested[1][features, config] = self._pipelines[key]
-        return self._pipelines[key]
+        self._pipelines[key] = pipeline = OpenCLPipeline(self, features, config, self.pipeline)
+        return pipeline
 
     def frame_config(self, view: View, count: int = 1) -> KernelConfig | None:
         """Smaller tiles for frames with too few tiles to occupy a GPU (devlog/tuning.md), except with a small
@@ -166,7 +160,7 @@ class OpenCLBackend(Workspace, Backend):
         return self._gradients[pipeline]
 
     def compile_in_background(self, features: FeatureSet) -> None:
-        if self._requested[1].get((features, None)) not in self._gradients:
+        if self._pipelines.get((features, None, self.config)) not in self._gradients:
             self._background.begin(features, lambda: self.differentiate(features).compile_step())
 
     def training(self) -> OpenCLTraining:
@@ -178,15 +172,6 @@ class OpenCLBackend(Workspace, Backend):
             if self._alignment is None:
                 self._alignment = OpenCLAlignment(self)
             return self._alignment
-
-    def _key(self, features: FeatureSet, config: KernelConfig | None) -> tuple[FeatureSet, KernelConfig]:
-        if not self.info.float64 and features.projection_precision != "float32":
-            features = replace(features, projection_precision="float32")
-        return features, config or config_for(features, self.config)
-
-    def source(self, features: FeatureSet) -> KernelSource:
-        """Kernel source of these features for this device."""
-        return assemble(*self._key(features, None))
 
     @property
     def memory_bytes(self) -> int:

@@ -18,7 +18,7 @@ from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.kernel_interface import RAW
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.uniforms import projection_arrays, scalar_arguments
+from fidsplat.backends.opencl.uniforms import array_arguments, scalar_arguments
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
@@ -226,11 +226,12 @@ class DeviceFrame:
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """Bind a scratch buffer; the next frame overwrites it."""
-        return self.bind(name, self.pool.scratch(name, size))
+        buffer = self.named[name] = self.pool.scratch(name, size)
+        return buffer
 
     def acquire(self, name: str, size: int) -> cl.Buffer:
         """Bind a buffer that belongs to the frame until its images are released."""
-        buffer = self.acquired[name] = self.bind(name, self.pool.acquire(name, size))
+        buffer = self.acquired[name] = self.named[name] = self.pool.acquire(name, size)
         return buffer
 
     def upload(self, name: str, array: np.ndarray | DeviceRecord) -> cl.Buffer:
@@ -239,10 +240,6 @@ class DeviceFrame:
         buffer, event = self.pool.upload(self.queue, name, array)
         if event is not None:
             self.uploads.append(event)
-        return self.bind(name, buffer)
-
-    def bind(self, name: str, buffer: cl.Buffer) -> cl.Buffer:
-        """Bind a buffer to the kernel argument of this name."""
         self.named[name] = buffer
         return buffer
 
@@ -258,19 +255,12 @@ class DeviceFrame:
         pixels = (view.height // view.samples) * (view.width // view.samples)
         for output in outputs:
             self.acquire(f"{output.name}_out", 4 * pixels * output.channels)
-        self.upload("batch_indices", self.batch.batch_indices)
-
-    def bind_images(self, images: dict[str, cl.Buffer]) -> None:
-        """Bind the output images of the complete batch, of which these views fill a part."""
-        self.named |= images
-        self.upload("batch_indices", self.batch.batch_indices)
 
     def upload_view(self, row: int, end: int) -> None:
-        """Copy the projection's uniforms to the device, for rows of samples [row, end)."""
+        """Copy the arrays of the views to the device, for rows of samples [row, end)."""
         if self.view.raster is not None:
             self.bind_rays()
-        arrays = projection_arrays(self.batch, self.source, row, end)
-        for name, array in arrays.items():
+        for name, array in array_arguments(self.batch, self.source, row, end).items():
             self.upload(name, array)
 
     def rendered(self) -> Rendered:

@@ -65,7 +65,7 @@ def render_sort_first(frame: DeviceFrame) -> None:
             break
         big = counts.big
         frame.discard_launches()
-    for tile_range in tiling.sorted_tile_ranges(frame, frame.first_tile, frame.end_tile, counts.pairs):
+    for tile_range in tiling.tile_ranges(frame, frame.first_tile, frame.end_tile, counts.pairs):
         tiling.list_sorted(frame, tile_range, count)
         blend(frame, tile_range)
     resolve(frame)
@@ -108,7 +108,7 @@ def complete_bin_first(frame: DeviceFrame, counted: cl.Event, capacity: int) -> 
     if capacity and counts.pairs <= capacity:
         return
     tiling.start_lists(frame, _UNLIMITED)
-    tile_ranges = tiling.unsorted_tile_ranges(frame, counts.pairs)
+    tile_ranges = tiling.tile_ranges(frame, 0, frame.tiles, counts.pairs)
     with_margin = min(counts.pairs * 5 // 4, frame.workspace.pair_budget)
     capacity = max(with_margin, *(tile_range.pairs for tile_range in tile_ranges))
     for tile_range in tile_ranges:
@@ -132,7 +132,7 @@ def render_in_slices(frame: DeviceFrame) -> None:
         tiling.count_pairs(frame, packed.count)
         first, last = top * frame.tiles_x, end * frame.tiles_x
         listed = int(tiling.tile_pairs(frame)[first:last].sum(dtype=np.int64))
-        for tile_range in tiling.sorted_tile_ranges(frame, first, last, listed):
+        for tile_range in tiling.tile_ranges(frame, first, last, listed):
             tiling.list_sorted(frame, tile_range, packed.count)
             blend(frame, tile_range)
         visible, pairs = max(visible, packed.visible), pairs + listed
@@ -172,7 +172,8 @@ def render_sub_frames(frame: DeviceFrame) -> None:
     """Blend the sub-frames of a shutter one after another, and resolve their mean."""
     for samples in frame.sample_buffers:
         size = 4 * frame.rows * frame.stride * samples.channels
-        frame.bind(samples.name, frame.pool.scratch(f"accumulated {samples.name}", size))
+        frame.named[samples.name] = frame.pool.scratch(f"accumulated {samples.name}", size)
+    frame.upload("batch_indices", frame.batch.batch_indices)
     background_arrays = {
         name: frame.upload(name, frame.view.array(name))
         for name, argument in frame.source.arguments.get("composite_background", {}).items()

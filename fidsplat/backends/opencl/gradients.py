@@ -33,7 +33,7 @@ from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.uniforms import scalars_of
+from fidsplat.backends.opencl.uniforms import scalar_arguments
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
@@ -125,7 +125,8 @@ class OpenCLGradients(GradientPipeline):
         commands, key = self._tile_commands, self._key(frame)
         if key is not None and commands.key == key:
             values = {f"grad_{name}": frame.named[f"grad_{name}"] for name in self._output_gradients}
-            commands.set({**scalars_of(frame.view), "log_ceiling": ceiling, **frame.acquired, **values})
+            scalars = scalar_arguments(frame.view, self.source)
+            commands.set({**scalars, "log_ceiling": ceiling, **frame.acquired, **values})
             frame.events += commands.submit(frame.queue)
             frame.stages += commands.stages
             self._check_capacity(frame)
@@ -203,7 +204,7 @@ class OpenCLGradients(GradientPipeline):
                         f"the gradient of {name} must be a complete, contiguous float32 array, got "
                         f"{gradient.dtype} at offset {gradient.offset}; copy it first"
                     )
-                frame.bind(f"grad_{name}", gradient.data)  # pyright: ignore[reportArgumentType]
+                frame.named[f"grad_{name}"] = gradient.data  # pyright: ignore[reportArgumentType]
             else:
                 frame.upload(f"grad_{name}", np.ascontiguousarray(gradient, np.float32))
 

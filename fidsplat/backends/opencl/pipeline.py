@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +13,7 @@ import pyopencl as cl
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.opencl import tiling
-from fidsplat.backends.opencl.assemble import KernelSource, culls_before_projection
+from fidsplat.backends.opencl.assemble import KernelSource, assemble, culls_before_projection
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.frame import render
@@ -25,7 +25,6 @@ from fidsplat.backends.opencl.recorded_frame import RecordedFrame, Replay
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
-from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 from fidsplat.util.errors import DeviceError
 
@@ -39,34 +38,31 @@ _MAX_RASTERS = 4
 """maximum number of lenses of cached frames: as many as `raster_of` caches"""
 
 
-@dataclass
-class CachedFrame:
-    """Cached memory plan and command list of a rendered frame."""
-
-    plan: MemoryPlan
-    buffer_key: tuple[Any, ...]
-    """key of frames with equal buffer sizes"""
-    raster: RayRaster | None
-    """rays of the lens, referenced to keep their buffers on the device"""
-    recorded: RecordedFrame | None = None
-
-
 class OpenCLPipeline(Pipeline):
     """Stages compiled for one feature set; renders views and batches, and replays their command lists."""
 
     def __init__(
         self,
         workspace: Workspace,
-        source: KernelSource,
         features: FeatureSet,
         config: KernelConfig,
         pipeline_for: Callable[[FeatureSet, KernelConfig], OpenCLPipeline],
     ) -> None:
         """pipeline_for: function that returns the pipeline with another config."""
-        self.workspace, self.source, self.features, self.config = workspace, source, features, config
+        self.workspace, self.features, self.config = workspace, features, config
         self.outputs = {output.name: output for output in features.images}
-        self._planner = MemoryPlanner(workspace, source, features, config)
         self._pipeline_for = pipeline_for
+        self._variants: dict[tuple[tuple[str, Any], ...], OpenCLPipeline] = {}
+        """pipelines with other build constants, by the changed constants"""
+
+    @cached_property
+    def source(self) -> KernelSource:
+        """The text of the kernels, and their declarations."""
+        return assemble(self.features, self.config)
+
+    @cached_property
+    def _planner(self) -> MemoryPlanner:
+        return MemoryPlanner(self.workspace, self.source, self.features, self.config)
 
     @cached_property
     def program(self) -> Program:
@@ -80,33 +76,28 @@ class OpenCLPipeline(Pipeline):
 
     def render_view(self, resident: Resident, view: View) -> OpenCLImages:
         """Render one view. A frame whose command list is cached is replayed, on a GPU without waiting."""
-        if self._is_too_small_to_vectorise(resident):
-            return self._unvectorised.render_view(resident, view)
+        fastest = self._for_cloud(resident)
+        if fastest is not self:
+            return fastest.render_view(resident, view)
         with self.workspace.rendering():
             key = self._key(view)
             cached = resident.cached_frames.get(key) if view.sample_rows is None else None
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
-            if resident.is_spatially_sorted and self.config.binning == "bin_first":
-                return self._with_binning("bin_local").render_view(resident, view)
-            if resident.count >= MIN_CULLED and resident.sortable and self._culls:
-                culling = self._pipeline_for(self.features, replace(self.config, culls_first=True))
-                return culling.render_view(resident, view)
             plan = self._planner.frame(resident, view)
             if plan.slice_size and self.config.binning != "sort_first":
-                # frames in slices use only this strategy; it is the fastest with little memory
-                return self._with_binning("sort_first").render_view(resident, view)
-            frame = self._render_planned(resident, view, plan)
+                return self._in_slices().render_view(resident, view)
+            frame = self._render_frame(resident, view, plan)
             complete = not (plan.slice_size or frame.in_tile_ranges or view.sub_frames or view.sample_rows)
             if complete and resident.count and not resident.streamed:
-                self._cache(resident, key, frame)
+                self._cache(resident, key, plan)
             return OpenCLImages(self, view, [frame.rendered()], resident.count)
 
     def render(self, resident: Resident, views: ViewBatch) -> OpenCLImages:
         if views.is_single:
             return self.render_view(resident, views.view_at(0))
         if self._is_too_small_to_vectorise(resident):
-            return self._unvectorised.render(resident, views)
+            return self._with(splats_per_item=1).render(resident, views)
         workspace, rendered = self.workspace, []
         with workspace.rendering():
             workspace.switch_to(workspace.queue)
@@ -115,10 +106,10 @@ class OpenCLPipeline(Pipeline):
             for first, end, plan in self._planner.parts(resident, views):
                 part = views.part(first, end)
                 pipeline = self._for_part(resident, plan, part)
-                buffers = pipeline, "views", resident.capacity, plan
-                workspace.pool.trim(buffers, workspace.memory_budget - plan.total)
+                size_key = pipeline, "views", resident.capacity, plan
+                workspace.pool.trim(size_key, workspace.memory_budget - plan.total)
                 frame = DeviceFrame(workspace, pipeline._commands, pipeline.config, resident, part, plan)
-                frame.bind_images(images)
+                frame.named |= images  # of the complete batch, of which these views fill a part
                 render(frame)
                 rendered.append(frame.rendered())
             return OpenCLImages(self, views, rendered, resident.count, acquired)
@@ -133,11 +124,11 @@ class OpenCLPipeline(Pipeline):
         """Render one frame without slices and ranges of tiles; returns its buffers, valid until the next
         frame. Raises DeviceError if it exceeds the memory budget."""
         if self._is_too_small_to_vectorise(resident):
-            return self._unvectorised.render_undivided(resident, view)
+            return self._with(splats_per_item=1).render_undivided(resident, view)
         with self.workspace.rendering():
             plan, frame = self._planner.frame(resident, view), None
             if not plan.slice_size:
-                frame = self._render_planned(resident, view, plan)
+                frame = self._render_frame(resident, view, plan)
             if frame is None or frame.pairs > self.workspace.pair_budget:
                 raise DeviceError(
                     "frames with derivatives must fit the memory budget without slices or ranges of tiles, "
@@ -153,63 +144,70 @@ class OpenCLPipeline(Pipeline):
             return self.render_undivided(resident, view)
         workspace, key = self.workspace, (*self._key(view), pair_limit)
         with workspace.rendering():
-            cached, queue = resident.cached_frames.get(key), workspace.switch_to(workspace.queue)
-            recorded = None if cached is None else cached.recorded
-            if cached is not None and recorded is not None and recorded.set_view(view, queue):
+            recorded, queue = resident.cached_frames.get(key), workspace.switch_to(workspace.queue)
+            if recorded is not None and recorded.set_view(view, queue):
                 frame = DeviceFrame(
                     *(workspace, recorded.commands, self.config, resident),
-                    *(ViewBatch.single(view), cached.plan, queue, pair_limit),
+                    *(ViewBatch.single(view), recorded.plan, queue, pair_limit),
                 )
-                recorded.render(frame)
+                recorded.replay_into(frame)
                 frame.recorded = recorded
                 return frame
             plan = self._planner.frame(resident, view)
-            buffers = self._buffer_key(resident, view, plan)
-            workspace.pool.trim(buffers, workspace.memory_budget - plan.total, resident.capacity)
+            self._trim(resident, view, plan)
             if plan.slice_size or not tiling.pair_capacity(workspace, self.config):
                 return self.render_undivided(resident, view)
-            resident.cached_frames.pop(key, None)  # after an interrupt the recording may be incomplete
-            commands = CommandList(self.program) if recorded is None else recorded.commands
-            frame = self._render_frame(resident, view, plan, commands, queue, pair_limit)
-            frame.recorded = recorded = RecordedFrame(frame)
-            resident.cached_frames[key] = CachedFrame(plan, buffers, None, recorded)
+            if recorded is None:
+                recorded = resident.cached_frames[key] = RecordedFrame(plan, CommandList(self.program))
+            frame = self._record(resident, view, plan, recorded, queue, pair_limit)
+            frame.recorded = recorded
             return frame
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
         return OpenCLImages(self, frame.view, [frame.rendered()], frame.resident.count)
 
     def render_again(self, resident: Resident, view: View) -> Rendered:
-        """Render a frame whose replay exceeded its capacity again, with larger buffers."""
+        """Render a frame with larger buffers, after its replay exceeded the capacity."""
         with self.workspace.rendering():
-            return self._render_planned(resident, view, self._planner.frame(resident, view)).rendered()
+            return self._render_frame(resident, view, self._planner.frame(resident, view)).rendered()
 
-    def _replay(self, resident: Resident, view: View, cached: CachedFrame) -> OpenCLImages | None:
+    def _replay(self, resident: Resident, view: View, recorded: RecordedFrame) -> OpenCLImages | None:
         """Replay a cached frame for another view; None if its buffers are too small or were replaced."""
-        workspace, recorded, waits = self.workspace, cached.recorded, self.config.binning == "sort_first"
-        workspace.pool.trim(cached.buffer_key, workspace.memory_budget - cached.plan.total, resident.capacity)
+        workspace, waits = self.workspace, self.config.binning == "sort_first"
+        self._trim(resident, view, recorded.plan)
         if not waits and not tiling.pair_capacity(workspace, self.config):
             return None
         queue = workspace.switch_to(workspace.queue if waits else workspace.replay_queue)
-        if recorded is not None and recorded.set_view(view, queue):
+        if recorded.set_view(view, queue):
             workspace.frames += 1
             rendered = recorded.submit(queue, resident.count)
             if rendered is None:
                 return None
         else:
-            commands = CommandList(self.program) if recorded is None else recorded.commands
-            cached.recorded = None  # after an interrupt the recording may be incomplete
-            frame = self._render_frame(resident, view, cached.plan, commands, queue)
-            rendered = frame.rendered()
-            if not frame.in_tile_ranges:
-                cached.recorded = recorded = RecordedFrame(frame)
+            rendered = self._record(resident, view, recorded.plan, recorded, queue).rendered()
         if waits:
             return OpenCLImages(self, view, [rendered], resident.count)
-        assert recorded is not None  # the lists of a recorded frame are not divided on a GPU
         replay = Replay(recorded, resident, view, self.render_again)
         images = OpenCLImages(self, view, [rendered], resident.count, replay=replay)
         if not resident.immutable:
             images.complete()
         return images
+
+    def _record(
+        self,
+        resident: Resident,
+        view: View,
+        plan: MemoryPlan,
+        recorded: RecordedFrame,
+        queue: cl.CommandQueue,
+        pair_limit: int = 0,
+    ) -> DeviceFrame:
+        """Render one frame, and record its launches unless it was rendered in ranges of tiles."""
+        recorded.generation = None  # after an interrupt the command list may be incomplete
+        frame = self._render_frame(resident, view, plan, recorded.commands, queue, pair_limit)
+        if not frame.in_tile_ranges:
+            recorded.record(frame)
+        return frame
 
     def _render_frame(
         self,
@@ -220,6 +218,7 @@ class OpenCLPipeline(Pipeline):
         replay_queue: cl.CommandQueue | None = None,
         pair_limit: int = 0,
     ) -> DeviceFrame:
+        self._trim(resident, view, plan)
         frame = DeviceFrame(
             *(self.workspace, commands or self._commands, self.config),
             *(resident, ViewBatch.single(view), plan, replay_queue, pair_limit),
@@ -228,62 +227,64 @@ class OpenCLPipeline(Pipeline):
         render(frame)
         return frame
 
-    def _render_planned(self, resident: Resident, view: View, plan: MemoryPlan) -> DeviceFrame:
-        # release the buffers of frames with other sizes; buffers of this size are part of the plan
-        free = self.workspace.memory_budget - plan.total
-        self.workspace.pool.trim(self._buffer_key(resident, view, plan), free, resident.capacity)
-        return self._render_frame(resident, view, plan)
-
-    def _buffer_key(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Any, ...]:
-        """Key of frames with equal buffer sizes."""
+    def _trim(self, resident: Resident, view: View, plan: MemoryPlan) -> None:
+        """Release the buffers of frames with other sizes; buffers of this size are part of the plan."""
         shared = resident.buffer_key if not plan.slice_size else None
-        return self, view.width, view.height, shared or (resident.capacity, plan)
+        size_key = self, view.width, view.height, shared or (resident.capacity, plan)
+        self.workspace.pool.trim(size_key, self.workspace.memory_budget - plan.total, resident.capacity)
 
-    def _cache(self, resident: Resident, key: tuple[Any, ...], frame: DeviceFrame) -> None:
+    def _cache(self, resident: Resident, key: tuple[Any, ...], plan: MemoryPlan) -> None:
         """Cache the plan of a frame; the next frame with this key is recorded."""
-        cached, raster = resident.cached_frames, frame.view.raster
-        if raster is not None:
-            rasters = {other.raster for other in cached.values()} - {None, raster}
-            if len(rasters) >= _MAX_RASTERS:
-                cached.clear()
-        if len(cached) >= _MAX_FRAMES:
+        cached = resident.cached_frames
+        rasters = {raster for _, _, _, raster, *_ in cached} | {key[3]}
+        if len(cached) >= _MAX_FRAMES or len(rasters - {None}) > _MAX_RASTERS:
             cached.clear()
-        buffers = self._buffer_key(resident, frame.view, frame.plan)
-        cached[key] = CachedFrame(frame.plan, buffers, raster)
+        cached[key] = RecordedFrame(plan, CommandList(self.program))
 
     def _key(self, view: View) -> tuple[Any, ...]:
         """Key of frames with the same command list, which differ only in numeric arguments."""
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
 
-    def _with_binning(self, binning: str) -> OpenCLPipeline:
-        """The pipeline with another tile-binning strategy."""
-        return self._pipeline_for(self.features, replace(self.config, binning=binning, culls_first=False))
+    def _for_cloud(self, resident: Resident) -> OpenCLPipeline:
+        """The pipeline with the fastest projection and tile binning for a cloud."""
+        if self._is_too_small_to_vectorise(resident):
+            return self._with(splats_per_item=1)
+        if self.config.binning != "bin_first" or self.config.culls_first:
+            return self
+        if resident.is_spatially_sorted:
+            return self._with(binning="bin_local")
+        if resident.count >= MIN_CULLED and resident.sortable and self._can_cull:
+            return self._with(culls_first=True)
+        return self
+
+    def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
+        """The pipeline with the fastest tile binning for a part of a batch."""
+        if self.config.binning != "bin_first":
+            return self
+        if plan.slice_size:
+            return self._in_slices()
+        few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
+        return self._with(binning="bin_local") if few or resident.is_spatially_sorted else self
+
+    def _in_slices(self) -> OpenCLPipeline:
+        """The pipeline for projection in slices, with the only tile binning that supports it."""
+        return self._with(binning="sort_first", culls_first=False)
+
+    def _with(self, **constants: Any) -> OpenCLPipeline:
+        """The pipeline with other build constants."""
+        key = tuple(constants.items())
+        if key not in self._variants:
+            self._variants[key] = self._pipeline_for(self.features, replace(self.config, **constants))
+        return self._variants[key]
 
     def _is_too_small_to_vectorise(self, resident: Resident) -> bool:
         """Whether compiling the vectorised projection would take longer than it saves, for a small cloud."""
         return self.config.splats_per_item > 1 and resident.count < MIN_VECTORISED
 
     @cached_property
-    def _culls(self) -> bool:
-        """Whether large clouds are rendered by the pipeline with frustum culling before projection."""
-        tiled = self.config.binning == "bin_first" and not self.config.culls_first
-        return tiled and culls_before_projection(self.features)
-
-    @cached_property
-    def _unvectorised(self) -> OpenCLPipeline:
-        """The pipeline whose projection is not vectorised, for small clouds: compiling the vectorised
-        projection takes longer than it saves."""
-        return self._pipeline_for(self.features, replace(self.config, splats_per_item=1))
-
-    def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
-        """The pipeline with the fastest tile-binning strategy for a part of a batch."""
-        if self.config.binning != "bin_first":
-            return self
-        if plan.slice_size:
-            return self._with_binning("sort_first")  # the only strategy of frames in slices
-        few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
-        return self._with_binning("bin_local") if few or resident.is_spatially_sorted else self
+    def _can_cull(self) -> bool:
+        return culls_before_projection(self.features)
 
     def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,)

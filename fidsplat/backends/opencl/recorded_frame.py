@@ -9,38 +9,35 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeAlias
 
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.opencl.buffers import DeviceRecord
+from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import COUNTERS, Capacity, Counts, enlarged, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
+from fidsplat.backends.opencl.memory_plan import MemoryPlan
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.backends.opencl.uniforms import projection_arrays, scalar_arguments
+from fidsplat.backends.opencl.uniforms import view_arguments
 from fidsplat.backends.view import View
 
-_VIEWS = 256
-"""maximum number of views whose uniforms are cached"""
-_VIEWS_BYTES = 1 << 26
-"""maximum bytes of cached arrays of views, such as external depth images"""
 _UPLOADS = 64
 """maximum number of pending copies to the device"""
 _ZERO = np.zeros(1, np.uint32)
-_CachedView: TypeAlias = tuple[View, dict[str, np.ndarray | DeviceRecord], dict[str, Any]]
-"""a view with its arrays and scalar arguments"""
 
 
 class RecordedFrame:
-    """The command list of a frame, and the arguments that differ between views. It must not reference the
-    cloud, which caches it."""
+    """The memory plan of rendered frames of a cloud and, once `record` is called, their command list with the
+    arguments that differ between views. It must not reference the cloud, which caches it."""
 
-    def __init__(self, frame: DeviceFrame) -> None:
-        self.workspace, self.commands, self.capacity = frame.workspace, frame.commands, frame.capacity
-        self.generation = frame.pool.generation
-        """`BufferPool.generation` of the bound scratch buffers"""
+    def __init__(self, plan: MemoryPlan, commands: CommandList) -> None:
+        self.plan, self.commands = plan, commands
+        self.generation: object = None
+        """`BufferPool.generation` of the bound scratch buffers; None if `commands` is not complete"""
+
+    def record(self, frame: DeviceFrame) -> None:
+        """Take over the arguments and buffer sizes of a frame that was launched by `commands`."""
+        self.plan, self.workspace, self.capacity = frame.plan, frame.workspace, frame.capacity
         self._waits = frame.waits
         """whether the host waits for the counts of each frame"""
         self._rows, self._counter_bytes = frame.rows, frame.pool.size("counters")
@@ -48,27 +45,23 @@ class RecordedFrame:
             pairs = min(frame.pool.size("lists") // 4, frame.workspace.pair_budget)
             self.capacity, self._counter_bytes = Capacity(self.capacity.big, pairs), 4 * COUNTERS
         self.launches_until_counts = frame.launches_until_counts
-        self._stages = self.commands.stages
-        self._source = frame.source
+        self._stages, self._source = self.commands.stages, frame.source
         self._view, self._arrays = frame.view, frame.arrays
-        self._views: dict[int, _CachedView] = {
-            id(frame.view): (frame.view, frame.arrays, scalar_arguments(frame.view, frame.source))
-        }
-        """rendered views with their arrays and scalar arguments"""
-        self._bytes = 0
         self._uploads: deque[cl.Event] = deque(frame.uploads, maxlen=_UPLOADS)
         self._acquired_sizes = [(name, buffer.size) for name, buffer in frame.acquired.items()]
         self._scratch_names = [name for name in frame.named if name not in frame.acquired]
+        self.generation = frame.pool.generation
 
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
-        """Bind the uniforms of a view. Returns False if a scratch buffer was replaced."""
-        pool = self.workspace.pool
-        if pool.generation is not self.generation:
+        """Bind the uniforms of a view. Returns False if the frame must be recorded (again), as there is no
+        recording, or a scratch buffer was replaced."""
+        if self.generation is None or self.generation is not self.workspace.pool.generation:
             return False
+        pool = self.workspace.pool
         if view is not self._view:
-            _, arrays, scalars = self._views.get(id(view)) or self._cache_view(view)
+            scalars, self._arrays = view_arguments(view, self._source, self._rows)
             self.commands.set(scalars)
-            self._view, self._arrays = view, arrays
+            self._view = view
         for name, array in self._arrays.items():
             _, event = pool.upload(queue, name, array)
             if event is not None:  # other frames have overwritten the buffer
@@ -110,33 +103,18 @@ class RecordedFrame:
         self.capacity, self.generation = Capacity(self.capacity.big, pairs), self.workspace.pool.generation
         return True
 
-    def render(self, frame: DeviceFrame) -> None:
+    def replay_into(self, frame: DeviceFrame) -> None:
         """Replay the bound view, and bind its buffers to `frame` for the backward pass."""
         rendered = self.submit(frame.queue, frame.resident.count)
         assert rendered is not None  # on CPUs frames with derivatives are not replayed
         frame.acquired, events = rendered.acquired, rendered.events
         for name in self._scratch_names:
             if (buffer := frame.pool.get(name)) is not None:
-                frame.bind(name, buffer)
+                frame.named[name] = buffer
         frame.named |= frame.acquired
         frame.scalars["big_capacity"], frame.pairs = self.capacity.big, self.capacity.pairs
         frame.events, frame.stages = events, self._stages.copy()
         frame.counted, frame.stats = events[self.launches_until_counts - 1], rendered.stats
-
-    def _cache_view(self, view: View) -> _CachedView:
-        arrays = projection_arrays(ViewBatch.single(view), self._source, 0, self._rows)
-        for name in self._source.view_arrays:
-            arrays[name] = view.array(name)
-        # count arrays that views share, such as a panorama, once
-        size = sum(array.nbytes for name, array in arrays.items() if array is not self._arrays.get(name))
-        if len(self._views) >= _VIEWS or self._bytes + size > _VIEWS_BYTES:
-            self._views.clear()
-            self._bytes = 0
-        self._bytes += size
-        # a reference to the view, so that no other view has its id
-        cached = view, self._arrays | arrays, scalar_arguments(view, self._source)
-        self._views[id(view)] = cached
-        return cached
 
 
 class Replay:
@@ -151,7 +129,7 @@ class Replay:
     ) -> None:
         """render_again: function that renders the view with sufficient buffers."""
         self._recorded, self._view, self._render_again = recorded, view, render_again
-        self._frame_number = recorded.workspace.frames
+        self._frame_number, self._capacity = recorded.workspace.frames, recorded.capacity
         self._resident: Resident | None = resident
         self._weak_resident = weakref.ref(resident)
 
@@ -165,7 +143,7 @@ class Replay:
             queue.flush()
             queue, after = workspace.read_queue, rendered.events[-1:]
         counts = Counts.read(queue, rendered.acquired["counts"], after)
-        complete = None if self._recorded.capacity.holds(counts) else self._render_again(resident, self._view)
+        complete = None if self._capacity.holds(counts) else self._render_again(resident, self._view)
         self._resident = None  # release the cloud, which is no longer needed
         return complete
 

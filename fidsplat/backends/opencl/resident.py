@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import weakref
 from abc import abstractmethod
-from collections.abc import Hashable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
@@ -42,8 +42,8 @@ class Resident(ResidentData):
         self.count = self.capacity = count
         """number of splats, and number of splats for which frames allocate buffers"""
         self._buffers: dict[str, cl.Buffer] = {}
-        self.cached_frames: dict[Hashable, Any] = {}
-        """command lists of rendered frames, by the properties that a frame must share to replay them"""
+        self.cached_frames: dict[tuple[Any, ...], Any] = {}
+        """each `RecordedFrame` by its key (`OpenCLPipeline._key`)"""
 
     @property
     def memory_bytes(self) -> int:

@@ -10,7 +10,6 @@ would serialise.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -57,7 +56,7 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
     frame.scratch("big", 4 * capacity)
     frame.scratch("big_bounds", frame.source.records["Bounds"].itemsize * capacity)
     if not frame.waits:  # the kernel sort_tiles clears them for the next replay
-        frame.bind("counters", frame.pool.zeroed("counters", 4 * words, frame.queue))
+        frame.buffers.counters = frame.pool.zeroed("counters", 4 * words, frame.queue)
         return
     counters = frame.scratch("counters", 4 * words)
     cl.enqueue_fill_buffer(frame.queue, counters, np.zeros(1, np.uint32), 0, 4 * words)
@@ -68,7 +67,7 @@ def cull(frame: DeviceFrame, big: int) -> None:
     pool, culling_groups = frame.pool, -(-frame.resident.count // CULLING_GROUP)
     frame.scratch("unculled", 4 * MIN_BIG // CULLING_GROUP)
     for name in ("spheres", "max_scales", "splat_ids"):
-        frame.bind(name, frame.resident.sorted_array(name))
+        frame.named[name] = frame.resident.sorted_array(name)
     while True:
         capacity = min(pool.size("unculled") // 4, culling_groups)
         frame.projected = CULLING_GROUP * capacity
@@ -90,7 +89,9 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     count, size = end - first, _splat_capacity(frame, end - first)
     if frame.config.culls_first:
         size = frame.projected
-    windows = _allocate_records(frame, size)
+    frame.scratch("splats", size * frame.source.records["Splat"].itemsize)
+    frame.scratch("keys", KEY_BYTES * size)
+    windows = frame.scratch("windows", WINDOW_BYTES * size)
     if frame.view.sample_rows is not None and size:
         # the kernel writes no window for splats outside `View.sample_rows`, so windows are first set to empty
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOW_BYTES * size)
@@ -103,13 +104,6 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         batch = frame.config.splats_per_item
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
-
-
-def _allocate_records(frame: DeviceFrame, size: int) -> cl.Buffer:
-    """Allocate records, keys and windows for `size` splats; returns the windows."""
-    frame.scratch("splats", size * frame.source.records["Splat"].itemsize)
-    frame.scratch("keys", KEY_BYTES * size)
-    return frame.scratch("windows", WINDOW_BYTES * size)
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
@@ -150,19 +144,21 @@ def count_pairs(frame: DeviceFrame, count: int) -> Counts:
     return Counts.of_counters(frame.read("counters", np.uint32, (views, COUNTERS)))
 
 
-def sorted_tile_ranges(frame: DeviceFrame, first: int, end: int, pairs: int) -> Iterable[TileRange]:
-    """Split tiles [first, end) into as many ranges as the pair budget requires."""
+def tile_ranges(frame: DeviceFrame, first: int, end: int, pairs: int) -> list[TileRange]:
+    """Split tiles [first, end) with these pairs into as many ranges as the pair budget requires."""
     budget = frame.workspace.pair_budget
     if pairs <= budget:
         return [TileRange(first, end, pairs)]
-    return [
-        TileRange(*tile_range) for tile_range in split_by_cost(tile_pairs(frame)[first:end], budget, first)
-    ]
+    frame.in_tile_ranges = True
+    ranges = split_by_cost(tile_pairs(frame)[first:end], budget, first)
+    return [TileRange(*tile_range) for tile_range in ranges]
 
 
 def tile_pairs(frame: DeviceFrame) -> np.ndarray:
-    """(tiles,) lengths of the lists, after `count_pairs`."""
-    return frame.read("bin totals", np.uint32, (frame.tiles,))
+    """(tiles,) lengths of the lists, after they are counted."""
+    if frame.config.binning == "sort_first":
+        return frame.read("bin totals", np.uint32, (frame.tiles,))
+    return frame.read("counters", np.uint32, (COUNTERS + frame.tiles,))[COUNTERS:]
 
 
 def list_sorted(frame: DeviceFrame, tile_range: TileRange, count: int) -> None:
@@ -217,8 +213,7 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
             break
         big *= 2
     if counts.count <= plan.max_visible:
-        for name, buffer in packed.items():
-            frame.bind(name, buffer)
+        frame.named |= packed
     return counts
 
 
@@ -296,7 +291,7 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
 def list_and_sort(frame: DeviceFrame, tile_range: TileRange, capacity: int, counts_visible: bool) -> None:
     frame.scratch("pairs", 8 * capacity)
     shared = frame.config.culls_first and not frame.in_tile_ranges
-    frame.bind("lists", frame.pool.scratch(_LISTS[shared], 4 * capacity))
+    frame.buffers.lists = frame.pool.scratch(_LISTS[shared], 4 * capacity)
     count, views, work_groups = frame.projected, frame.views, _big_groups(frame)
     arguments = {
         "first_tile": tile_range.first,
@@ -319,16 +314,6 @@ def list_and_sort(frame: DeviceFrame, tile_range: TileRange, capacity: int, coun
     frame.launch(
         "sort", "sort_tiles", ((tile_range.end - tile_range.first) * _ITEMS,), (_ITEMS,), **arguments
     )
-
-
-def unsorted_tile_ranges(frame: DeviceFrame, pairs: int) -> list[TileRange]:
-    """Split all tiles into as many ranges as the pair budget requires."""
-    budget = frame.workspace.pair_budget
-    if pairs <= budget:
-        return [TileRange(0, frame.tiles, pairs)]
-    frame.in_tile_ranges = True
-    counters = frame.read("counters", np.uint32, (COUNTERS + frame.tiles,))
-    return [TileRange(*tile_range) for tile_range in split_by_cost(counters[COUNTERS:], budget)]
 
 
 def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:
