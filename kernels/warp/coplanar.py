@@ -14,13 +14,13 @@ from . import output
 from .common import fma, fma3, struct_of
 from .fast import fast_log
 
-FAINT = wp.constant(1e-3)
+FAINT_ALPHA = wp.constant(1e-3)
 """alpha below which the optical depth is computed by a series (to 3e-7), as 1 - alpha is rounded"""
-DARKEST = wp.constant(wp.float32(2.0**-24))
+MIN_TRANSMITTANCE = wp.constant(wp.float32(2.0**-24))
 """minimum transmittance, so that the optical depth of an opaque fragment is finite"""
 
 
-NEARER = wp.constant(wp.float32(-(2.0**-16)))
+DEPTH_BIAS = wp.constant(wp.float32(-(2.0**-16)))
 """relative depth bias that sorts a layer in front of ungrouped splats in its plane"""
 
 
@@ -74,7 +74,7 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
         in front of ungrouped splats in its plane.
         """
         z = layer.mean.z
-        return fma(wp.abs(z), NEARER, z)
+        return fma(wp.abs(z), DEPTH_BIAS, z)
 
     @wp.func
     def close(layers: Layers):
@@ -118,8 +118,8 @@ def make_layer(Attributes, effects: tuple[str, ...], outputs: tuple[str, ...]) -
     def accumulate(layer: Layer, attributes: Attributes, alpha: float):
         """Add a fragment to a layer: optical depths -ln(1 - alpha) add up."""
         # an opaque fragment has the optical depth at which float32 transmittance is 0
-        tau = -log(wp.max(1.0 - alpha, DARKEST))
-        if alpha < FAINT:
+        tau = -log(wp.max(1.0 - alpha, MIN_TRANSMITTANCE))
+        if alpha < FAINT_ALPHA:
             tau = fma(0.5 * alpha, alpha, alpha)
         after = with_fragment(layer, attributes, tau)
         after.alpha = fma(alpha, 1.0 - layer.alpha, layer.alpha)

@@ -37,8 +37,9 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
     def exact(a: vec3, b: vec3, c: vec3, sizes: vec3, towards: vec3):
         """Equivalent disk with ellipsoid="exact", from scaled axes and their lengths.
 
-        W maps the covariance to the identity. Returns the scaled tangents of the disk that is perpendicular
-        to W `towards` there, its unit normal, its area, and 1 / m, infinite if the camera is at the centre.
+        W maps the covariance to the identity. Returns the scaled tangents of the disk whose image by W is
+        perpendicular to W `towards`, its unit normal, its area, and 1 / m, infinite if the camera is at the
+        centre.
 
         With e the longest axis and W p = (g, h) along e and across it, the tangents are the images of (h, -g)
         / m in the plane of both, and of the vector perpendicular to that plane. Neither has a difference
@@ -119,7 +120,7 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
         """
         c = unit_normal * sizes[2]
         u, v, normal, offset, third = a, b, unit_normal, zero, vec3()
-        inverse_m2, su, sv, log_share = zero, one, one, -real(wp.inf)
+        inverse_m2, su, sv, log_compensation = zero, one, one, -real(wp.inf)
         if wp.static(sharp):
             towards = p
             if wp.static(parallel):
@@ -128,7 +129,7 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
             if inverse_m < real(
                 wp.inf
             ):  # infinite if the camera is at the centre, where no ray has a maximum ahead
-                log_share = zero
+                log_compensation = zero
                 offset = wp.dot(normal, towards)
                 third = towards * inverse_m
                 if wp.static(not parallel):
@@ -141,10 +142,10 @@ def make_ellipsoids(effects: tuple[str, ...], real) -> SimpleNamespace:
                 if wp.static(parallel):
                     offset = one
                 su, sv = axes[0], axes[2]
-                log_share = zero
+                log_compensation = zero
                 if wp.static(antialiased):
-                    log_share = half * ln(before / after)
-        return u, v, normal, offset, third, inverse_m2, su, sv, log_share
+                    log_compensation = half * ln(before / after)
+        return u, v, normal, offset, third, inverse_m2, su, sv, log_compensation
 
     @wp.func
     def surface(tangent_u: vec3, tangent_v: vec3, tangent_w: vec3, sizes: vec3, p: vec3) -> vec3:

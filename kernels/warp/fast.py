@@ -14,7 +14,7 @@ from .common import fma
 _LOG2_E, _LN2_HIGH, _LN2_LOW = wp.constant(1.44269504), wp.constant(-0.693359375), wp.constant(2.12194440e-4)
 _LN2 = wp.constant(6.93147181e-1)
 _ROUNDER = wp.constant(12582912.0)  # 1.5 * 2^23: the last bits of a sum are the integer
-_LEAST = wp.constant(-87.0)
+_MIN_ARGUMENT = wp.constant(-87.0)
 _MANTISSA_BITS = wp.constant(wp.uint32(23))
 _MANTISSA = wp.constant(0x7FFFFF)
 _ROOT_HALF = wp.constant(0x3F3504F3)  # bits of sqrt(1/2)
@@ -23,7 +23,7 @@ _ROOT_HALF = wp.constant(0x3F3504F3)  # bits of sqrt(1/2)
 @wp.func
 def fast_exp(x: float) -> float:
     """e^x for x <= 0, within 2 ulp; e^-87 = 1.6e-38 below -87."""
-    y = wp.max(x, _LEAST)
+    y = wp.max(x, _MIN_ARGUMENT)
     sum = fma(y, _LOG2_E, _ROUNDER)
     k = sum - _ROUNDER
     r = fma(k, _LN2_LOW, fma(k, _LN2_HIGH, y))  # ln 2 in two words: the inner one is exact

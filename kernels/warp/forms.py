@@ -60,7 +60,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
         center_y: real,
         in_front: bool,  # whether the centre is imaged
         boxed: bool,
-        itself: bool,  # whether the splat is filtered by its own footprint
+        own_filter: bool,  # whether the splat is filtered by its own footprint
         thick: bool,
         inverse_m2: real,  # 1 / m^2 of a 3D Gaussian
         view: View,
@@ -135,7 +135,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
             record[at_flag] = wp.where(boxed, 1.0, 0.0)
         if wp.static(has_lowpass_disc):
             # far away without a low-pass disc
-            record[at_lowpass] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
+            record[at_lowpass] = wp.where(in_front and not own_filter, float(center_x - anchor_x), 1.0e18)
             record[at_lowpass + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
         if wp.static(exact):
             record[at_ellipsoid_term] = float(two * inverse_m2)

@@ -61,9 +61,9 @@ def make_project(
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
     of_box, disk = make_boxes(real), make_disk(real)
-    exact, drawn_ewa = EXACT in effects, any(name in effects for name in EWA)
-    thick_too = exact or drawn_ewa
-    surfaced = drawn_ewa and len(projects) > 0
+    exact, has_ewa = EXACT in effects, any(name in effects for name in EWA)
+    thick_too = exact or has_ewa
+    has_surface_normals = has_ewa and len(projects) > 0
     ellipsoid = make_ellipsoids(effects, real)
     limits, color_of, widened = (
         make_bounds(has_lowpass_disc),
@@ -76,7 +76,7 @@ def make_project(
     camera = next((name for name in effects if name in LENSES), None)
     parallel = "camera_orthographic" in effects
     ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # depths are distances
-    mapped, has_lens = camera == "camera_brown_conrady", camera is not None
+    has_lookup_table, has_lens = camera == "camera_brown_conrady", camera is not None
     edged = boxes_too and not has_lens  # straight edges, which records contain
     optics = make_optics(camera, real) if camera else None
     Lens, forms = make_lens(camera), make_forms(effects, outputs, real)
@@ -156,12 +156,12 @@ def make_project(
             depth = wp.length(p)
 
         near = real(view.near)
-        itself = bool(False)  # whether the splat is filtered by its own footprint
+        own_filter = bool(False)  # whether the splat is filtered by its own footprint
         boxed = bool(wp.static(all_boxes))
         if wp.static(mixed):
             boxed = boxes[i] != 0
         if wp.static(boxes_too):
-            itself = boxed
+            own_filter = boxed
         third = vec3()  # semi-axis of an ellipsoid conjugate to a and b
         outward = vec3()  # normal of the ellipsoid's surface, if it differs from the disk's normal
         inverse_m2 = zero
@@ -170,29 +170,29 @@ def make_project(
             thick = thickness[i] > 0.0
             if thick:
                 sizes = vec3(su, sv, real(wp.max(thickness[i], SMALLEST_SCALE)))
-                if wp.static(surfaced):
+                if wp.static(has_surface_normals):
                     outward = ellipsoid.surface(tangent_u, tangent_v, unit_normal, sizes, p)
-                a, b, unit_normal, offset, third, inverse_m2, su, sv, log_share = ellipsoid.disk(
+                a, b, unit_normal, offset, third, inverse_m2, su, sv, log_compensation = ellipsoid.disk(
                     a, b, unit_normal, sizes, p, view
                 )
-                log_opacity += float(log_share)
+                log_opacity += float(log_compensation)
                 half_r2 = log_opacity - view.log_alpha_cutoff
                 if not (half_r2 > 0.0):
                     return
-                itself = wp.static(drawn_ewa)
+                own_filter = wp.static(has_ewa)
         if wp.static(filtered):
-            if depth >= near and not itself:
+            if depth >= near and not own_filter:
                 by_x, by_y, by_depth, here = derivatives_at(p, view, lens)
                 if here:
-                    wide = widened(a, b, by_x, by_y, by_depth)
-                    log_opacity -= float(half * ln(wide[3]))
+                    widening = widened(a, b, by_x, by_y, by_depth)
+                    log_opacity -= float(half * ln(widening[3]))
                     half_r2 = log_opacity - view.log_alpha_cutoff
                     if not (half_r2 > 0.0):
                         return  # also edge-on for parallel rays: infinitely thin and faint
-                    a = wide[0] * a + wide[1] * b
-                    b = wide[2] * b
-                    su *= wide[0]
-                    sv *= wide[2]
+                    a = widening[0] * a + widening[1] * b
+                    b = widening[2] * b
+                    su *= widening[0]
+                    sv *= widening[2]
         radius = wp.sqrt(two * real(half_r2))
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range
         if wp.static(boxes_too):
@@ -251,7 +251,7 @@ def make_project(
         if wp.static(exact and not parallel and not has_lens):
             if thick and p[2] - reach < near:
                 box = ellipsoid.clipped(box, a, b, p, third, inverse_m2, view)
-        if wp.static(mapped):
+        if wp.static(has_lookup_table):
             x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
             y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)
             box = optics.lut_bounds(x0, x1, y0, y1, lens)
@@ -263,7 +263,7 @@ def make_project(
                 box.lowpass_x = float(center_x)
                 box.lowpass_y = float(center_y)
                 box.lowpass_r = wp.sqrt(half_r2 / view.sample_area) * (1.0 + PAD_RELATIVE) + PAD
-            if itself:
+            if own_filter:
                 box.lowpass_r = -1.0
         view = views[reread(number)]
         row_first, row_end = limits.rows(box, view.height)
@@ -282,7 +282,7 @@ def make_project(
         view = views[reread(number)]
         record, met = forms(
             a, b, unit_normal, offset, p, su, sv, center_x, center_y,
-            in_front, boxed, itself, thick, inverse_m2, view, lens,
+            in_front, boxed, own_filter, thick, inverse_m2, view, lens,
         )  # fmt: skip
         if not met:
             return
@@ -298,17 +298,17 @@ def make_project(
         record[at_box] = as_bits(first_column, end_column)
         record[at_box + 1] = as_bits(row_first, row_end)
         if wp.static(has_depth):
-            plane = int(-1)
+            coplanar_group = int(-1)
             if wp.static(layers):
-                plane = coplanar_groups[i]
-            middle, depth_reach = splat_pose.depth_range(depth, reach, radius, near, plane, boxed)
+                coplanar_group = coplanar_groups[i]
+            middle, depth_reach = splat_pose.depth_range(depth, reach, radius, near, coplanar_group, boxed)
             record[at_depth + 1] = float(middle)
             record[at_depth + 2] = float(depth_reach)
         key = float(depth)
         if wp.static(k_buffered):
             key = float(middle) - float(depth_reach)  # lower bound of the depths, as in blending
             record[at_nearest] = key
-        if wp.static(surfaced):
+        if wp.static(has_surface_normals):
             if thick:
                 unit_normal = outward
         for k in range(wp.static(len(projects))):

@@ -21,10 +21,10 @@ def make_resolve(
     Samples, Images = make_samples(tuple(sample_fields(outputs).items())), make_images(images, outputs)
     rays = make_rays(has_ray_lengths, has_ray_lengths)
     Rays, length_of = rays.Rays, rays.length_of
-    asked = {name for name, _ in images}
-    own = [name for name in outputs if name in asked]
-    over = [name for name in outputs if output.declared(name).over in asked]
-    resolving = output.having([*own, *over], "resolve")
+    requested = {name for name, _ in images}
+    names = [name for name in outputs if name in requested]
+    over = [name for name in outputs if output.declared(name).over in requested]
+    resolving = output.having([*names, *over], "resolve")
     resolves, background_shares = (
         output.functions(resolving, "resolve"),
         output.functions(outputs, "background_share"),

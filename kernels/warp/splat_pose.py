@@ -48,32 +48,32 @@ def make_splat_pose(effects: tuple[str, ...], real) -> SimpleNamespace:
         return tangent_u, tangent_v
 
     @wp.func
-    def depth_range(depth: real, reach: real, radius: real, near: real, plane: int, boxed: bool):
+    def depth_range(depth: real, reach: real, radius: real, near: real, coplanar_group: int, boxed: bool):
         """Middle and half of the depth range of a splat's fragments. reach: half of the range within the
-        cut-off. plane: coplanar group, -1 for none."""
-        middle, found = depth, reach
+        cut-off. coplanar_group: -1 for none."""
+        middle, half_range = depth, reach
         if wp.static(has_lowpass_disc):
             # the low-pass disc, which does not depend on the cut-off
             if not boxed:
-                found = reach * wp.max(one, range_radius / radius)
+                half_range = reach * wp.max(one, range_radius / radius)
         if wp.static(k_buffered):
             # depths of fragments below 1/255 of the splat's opacity are clamped, so that the order does not
             # depend on the cut-off
-            found = reach * (range_radius / radius)
+            half_range = reach * (range_radius / radius)
             if wp.static(boxes_too):
                 if boxed:
-                    found = reach
+                    half_range = reach
         if wp.static(layers):
             # the plane within a radius larger than every cut-off and low-pass
-            if plane >= 0:
-                found = reach * (plane_radius / radius)
+            if coplanar_group >= 0:
+                half_range = reach * (plane_radius / radius)
                 if wp.static(boxes_too):
                     if boxed:
-                        found = reach * plane_radius
+                        half_range = reach * plane_radius
         if depth < near:
             # fragments are beyond `near`
-            furthest = wp.max(near, depth + found)
-            middle, found = half * (furthest + near), half * (furthest - near)
-        return middle, found
+            furthest = wp.max(near, depth + half_range)
+            middle, half_range = half * (furthest + near), half * (furthest - near)
+        return middle, half_range
 
     return SimpleNamespace(Moving=Moving, pose=pose, tangents=tangents, depth_range=depth_range)

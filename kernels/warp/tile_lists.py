@@ -234,10 +234,10 @@ _SORT_LIST = """
         scale = static_cast<unsigned int>(min(factor, wp::uint64(0xffffffffu)));
         for (int k = item; k < length; k += BLOCK) atomicAdd(ends + bucket_of(from[k]), 1);
         __syncthreads();
-        constexpr int each = BUCKETS / BLOCK;
-        int lengths[each], own = 0;
-        for (int n = 0; n < each; n++) {
-            lengths[n] = ends[each * item + n];
+        constexpr int per_thread = BUCKETS / BLOCK;
+        int lengths[per_thread], own = 0;
+        for (int n = 0; n < per_thread; n++) {
+            lengths[n] = ends[per_thread * item + n];
             overfull = overfull || lengths[n] > LIMIT;
             own += lengths[n];
         }
@@ -246,8 +246,8 @@ _SORT_LIST = """
         overfull = __syncthreads_or(overfull);
         for (int before = 0; before < warp; before++) sum += sums[before];
         sum -= own;
-        for (int n = 0; n < each; n++) {
-            ends[each * item + n] = sum;
+        for (int n = 0; n < per_thread; n++) {
+            ends[per_thread * item + n] = sum;
             sum += lengths[n];
         }
         __syncthreads();
@@ -539,24 +539,24 @@ def make_list_big(has_lowpass_disc: bool):
         view = views[0]
         item, step = wp.tid() % wp.block_dim(), wp.block_dim()
         count = counters[0]
-        each = wp.clamp((count + blocks - 1) / blocks, 1, wp.min(SHARED_SPLATS, step))
-        group = first + wp.tid() / step
+        per_block = wp.clamp((count + blocks - 1) / blocks, 1, wp.min(SHARED_SPLATS, step))
+        base = first + wp.tid() / step
         entries = shared_memory()
-        while group < count:
-            cells = int(0)
-            # splats of a group are not neighbours in the list, since large ones often are
-            if item < each and group + item * blocks < count:
-                left, top, columns, rows = limits.tile_rectangle(bounds[big[group + item * blocks]], view)
-                cells = columns * rows
-            total = block_prefix_sum(entries, cells)
+        while base < count:
+            tiles = int(0)
+            # the splats of a block are not neighbours in the list, since large ones often are
+            if item < per_block and base + item * blocks < count:
+                left, top, columns, rows = limits.tile_rectangle(bounds[big[base + item * blocks]], view)
+                tiles = columns * rows
+            total = block_prefix_sum(entries, tiles)
             entry = int(item)
             while entry < total:
                 owner = owner_of(entries, entry)
-                index = big[group + owner * blocks]
+                index = big[base + owner * blocks]
                 b = bounds[index]
                 left, top, columns, rows = limits.tile_rectangle(b, view)
-                cell = entry - first_entry(entries, owner)
-                row, column = top + cell / columns, left + cell % columns
+                n = entry - first_entry(entries, owner)
+                row, column = top + n / columns, left + n % columns
                 begin, end = limits.tile_span(b, row, view)
                 if column >= begin and column < end:
                     tile = corner_tile(index, view) + row * view.tiles_x + column
@@ -565,6 +565,6 @@ def make_list_big(has_lowpass_disc: bool):
                         tile, key, index, False, first_tile, end_tile, cursors, first_cursor, capacity, pairs
                     )
                 entry += step
-            group += blocks * each
+            base += blocks * per_block
 
     return list_big
