@@ -67,7 +67,7 @@ def times(backend: Backend, scene: str, quality: str | None, repeats: int) -> di
     """Median milliseconds of a frame and its gradients, and of each stage."""
     cloud, camera = load_scene(scene)
     features, view = prepare(cloud, fs.Capture(camera, quality=quality))
-    pipeline, resident = backend.differentiate(features), backend.upload(cloud)
+    pipeline, resident = backend.gradient_pipeline(features), backend.upload(cloud)
     loss = random_loss(features, view)
 
     def step() -> dict[str, float]:
@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("--quality", help="render quality (default: standard)")
     given = parser.parse_args()
     renderer = fs.Renderer(given.device)
-    if not renderer.backend.has("differentiate"):
+    if not renderer.backend.has("gradient_pipeline"):
         raise InputError(f"--device must have gradients, got {given.device}; use an OpenCL or a Warp device")
     backend = renderer.backend
     if given.time:

@@ -108,12 +108,12 @@ def derivatives(
     """An image's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
 
     distorted: images of depths have their distortion too. build: further arguments of
-    `Backend.differentiate`.
+    `Backend.gradient_pipeline`.
     """
     features, view = prepare(cloud, capture)
     if distorted and "depth" in features.names:
         features = with_distortion(features)
-    pipeline = backend.differentiate(features, **build)
+    pipeline = backend.gradient_pipeline(features, **build)
     images = pipeline.forward(backend.upload(cloud), view)
     given = random_loss(features, view) if by_images is None else by_images
     gradients = pipeline.backward(images, given)

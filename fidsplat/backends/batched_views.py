@@ -43,7 +43,7 @@ class ViewBatch:
     total: int = 1
     views: tuple[View, ...] = ()
     """the views, if they differ from `view` in more than their poses"""
-    stacked: bool = True
+    same_uniforms: bool = True
     """whether the views differ only in poses and `camera_parameters`; if not, they are rendered one by one"""
 
     def __len__(self) -> int:
@@ -61,13 +61,15 @@ class ViewBatch:
 
     @staticmethod
     def single(view: View) -> ViewBatch:
+        """A batch of one view."""
         if view.groups:
-            return _stacked((view,), {}, _INDEX_0, 1)
+            return _stack((view,), {}, _INDEX_0, 1)
         poses = view.rotation[None, None], view.translation[None, None], view.eye[None, None]
         return ViewBatch(view, *poses, batch_indices=_INDEX_0, views=(view,))
 
     @staticmethod
     def of(views: Sequence[View], batch_indices: np.ndarray, total: int) -> ViewBatch:
+        """A batch of v views. batch_indices: (v,) uint32. total: number of views, including masked views."""
         first = views[0]
         labels = [label for label, _ in first.groups]
         for view in views:
@@ -79,7 +81,7 @@ class ViewBatch:
                     batch_indices=batch_indices,
                     total=total,
                     views=tuple(views),
-                    stacked=False,
+                    same_uniforms=False,
                 )
         camera_parameters = {
             name: np.array([getattr(view, name) for view in views], np.float64) for name in _PER_VIEW
@@ -87,7 +89,7 @@ class ViewBatch:
         camera_parameters = {
             name: values for name, values in camera_parameters.items() if (values != values[0]).any()
         }
-        return _stacked(views, camera_parameters, batch_indices, total)
+        return _stack(views, camera_parameters, batch_indices, total)
 
     @staticmethod
     def of_poses(
@@ -126,8 +128,8 @@ class ViewBatch:
         arrays = np.stack(rotations), np.stack(translations), np.stack(eyes)
         return ViewBatch(view, *arrays, batch_indices=batch_indices, total=total)
 
-    def part(self, first: int, end: int) -> ViewBatch:
-        """Sub-batch of the rendered views [first, end)."""
+    def sub_batch(self, first: int, end: int) -> ViewBatch:
+        """The batch of the rendered views [first, end) alone."""
         indices = self.batch_indices[first:end].copy()
         if end - first == 1:
             return replace(ViewBatch.single(self.view_at(first)), batch_indices=indices, total=self.total)
@@ -149,27 +151,27 @@ class ViewBatch:
         """One of the rendered views, by its number."""
         if self.views:
             return self.views[number]
-        own: dict[str, Any] = {
-            name: _plain(values[number]) for name, values in self.camera_parameters.items()
+        uniforms: dict[str, Any] = {
+            name: _as_python(values[number]) for name, values in self.camera_parameters.items()
         }
         external = self.view.external_depth
         if external and external.stacked:
-            own["external_depth"] = external.of_views(number)
+            uniforms["external_depth"] = external.of_views(number)
 
         def at(view: View, group: int) -> View:
             arrays = {name: getattr(self, name)[group, number] for name in ("rotation", "translation", "eye")}
-            return replace(view, **own, **arrays)
+            return replace(view, **uniforms, **arrays)
 
         groups = tuple((label, at(view, k + 1)) for k, (label, view) in enumerate(self.view.groups))
         return replace(at(self.view, 0), groups=groups)
 
 
-def _stacked(
+def _stack(
     views: Sequence[View], camera_parameters: Mapping[str, np.ndarray], batch_indices: np.ndarray, total: int
 ) -> ViewBatch:
-    own = [[view, *(moved for _, moved in view.groups)] for view in views]
+    groups_of_views = [[view, *(moved for _, moved in view.groups)] for view in views]
     rotation, translation, eye = (
-        np.stack([[getattr(group, name) for group in each] for each in own], axis=1)
+        np.stack([[getattr(group, name) for group in groups] for groups in groups_of_views], axis=1)
         for name in ("rotation", "translation", "eye")
     )
     return ViewBatch(
@@ -177,5 +179,5 @@ def _stacked(
     )
 
 
-def _plain(value: np.ndarray) -> float | tuple[float, ...]:
+def _as_python(value: np.ndarray) -> float | tuple[float, ...]:
     return tuple(value.tolist()) if value.ndim else float(value)

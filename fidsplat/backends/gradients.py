@@ -19,8 +19,8 @@ NOT_LATEST_FRAME = (
 
 
 class CapacityExceeded(Exception):
-    """Error: the (splat, tile) pairs of a frame, submitted before their number was known, exceeded its
-    buffers."""
+    """Raised if a frame that was submitted before its number of (splat, tile) pairs was known has more pairs
+    than its buffers hold."""
 
 
 class DifferentiableImages:
@@ -53,7 +53,8 @@ class DifferentiableImages:
 
 
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:
-    """Shape of the gradient with respect to an output, equal to the shape of its image."""
+    """Shape of the gradient with respect to an output, equal to the shape of its image: frames with gradients
+    have one sample per pixel."""
     channels = IMAGES[name].channels
     return (view.height, view.width) if channels == 1 else (view.height, view.width, channels)
 

@@ -1,4 +1,4 @@
-"""Interface of a device: base classes whose optional methods raise an error by default."""
+"""Interface of a device: base classes whose optional methods return a default or raise an error."""
 
 from __future__ import annotations
 
@@ -183,10 +183,10 @@ class SeparateImages(Images):
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         if index is not None:
             return np.full(shape, output.empty_value, output.dtype)
-        made = np.full((self.views, *shape), output.empty_value, output.dtype)
+        stack = np.full((self.views, *shape), output.empty_value, output.dtype)
         for number, images in self._images.items():
-            made[number] = images.read(name, 0)
-        return made
+            stack[number] = images.read(name, 0)
+        return stack
 
     def wait(self) -> None:
         for images in self._images.values():
@@ -210,16 +210,16 @@ def check_batch_memory(views: int, size: int, budget: int) -> None:
         )
 
 
-def batch_stats(each: Iterable[Mapping[str, int]], splats: int) -> dict[str, int]:
+def batch_stats(view_stats: Iterable[Mapping[str, int]], splats: int) -> dict[str, int]:
     """Number of splats of the cloud, and of visible splats and (splat, tile) pairs, summed over views."""
-    return summed([{"visible": 0, "pairs": 0}, *each]) | {"splats": splats}
+    return summed([{"visible": 0, "pairs": 0}, *view_stats]) | {"splats": splats}
 
 
-def summed(counts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+def summed(mappings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Add up mappings from names to numbers, name by name."""
     sums: dict[str, Any] = {}
-    for each in counts:
-        for name, value in each.items():
+    for mapping in mappings:
+        for name, value in mapping.items():
             sums[name] = sums.get(name, 0) + value
     return sums
 
@@ -233,9 +233,11 @@ class Pipeline(ABC):
 
     def render(self, resident: Any, views: ViewBatch) -> Images:
         """Render several views, each bit-identical to rendering it alone. By default one after another."""
-        each = enumerate(views.batch_indices.tolist())
-        rendered = {index: self.render_view(resident, views.view_at(number)) for number, index in each}
-        return SeparateImages(rendered, views, resident.count)
+        images = {
+            index: self.render_view(resident, views.view_at(number))
+            for number, index in enumerate(views.batch_indices.tolist())
+        }
+        return SeparateImages(images, views, resident.count)
 
     def render_subsampled(
         self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
@@ -280,11 +282,11 @@ class GradientPipeline(ABC):
 
         Returns:
             Device arrays, bit-identical on every run and valid until the next call: `means` (n, 3), `quats`
-            (n, 4), `scales` (n, 2), `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3); `grad2d` (n,), the
-            norm of the gradient with respect to the projected centre in units of half images (dL_dmean2D of
-            2DGS trainers); `background` (3,); `pose` (6,), rotation vector [1 / rad] and translation [1 / m]
-            of a motion after world_to_camera, in camera axes; `intrinsics` (4,): fx, fy, cx, cy [1 / px].
-            Culled splats have zeros.
+            (n, 4), `scales` (n, 2), `thickness` (n,) if the cloud has it, `opacities` (n,), `colors` (n, 3)
+            or `sh` (n, k, 3); `grad2d` (n,), the norm of the gradient with respect to the projected centre in
+            units of half images (dL_dmean2D of 2DGS trainers); `background` (3,); `pose` (6,), rotation
+            vector [1 / rad] and translation [1 / m] of a motion after world_to_camera, in camera axes;
+            `intrinsics` (4,): fx, fy, cx, cy [1 / px]. Culled splats have zeros.
 
         Raises:
             CapacityExceeded: `forward` did not wait, and the buffers were too small; the next frame has
@@ -316,7 +318,7 @@ class Backend(ABC):
         """Whether the device implements an optional method, for example `probe`."""
         return getattr(type(self), method) is not getattr(Backend, method)
 
-    def lacks(self, requirement: str, remedy: str) -> str:
+    def unsupported_message(self, requirement: str, remedy: str) -> str:
         """Error message for an operation that the device does not support."""
         return f"device must {requirement}, got {self.info.name}; {remedy}"
 
@@ -339,50 +341,58 @@ class Backend(ABC):
 
     def limit_memory(self, budget: int) -> None:
         """Limit the device memory of a frame and its cloud to `budget` bytes."""
-        raise InputError(self.lacks("have a memory budget", f"leave out memory_budget={budget}"))
+        raise InputError(
+            self.unsupported_message("have a memory budget", f"leave out memory_budget={budget}")
+        )
 
     def wrap_arrays(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
         """Use arrays that are already on the device (`means`, `quats`, ...) as a cloud, without a copy."""
-        raise InputError(self.lacks("wrap arrays", "use a Warp device, or a SplatCloud"))
+        raise InputError(self.unsupported_message("wrap arrays", "use a Warp device, or a SplatCloud"))
 
     def chunk_cache(self, chunks: Any) -> Any:
         """A device cache for the chunks of a scene, a `streaming.device_chunks.DeviceChunks`."""
-        raise DeviceError(self.lacks("cache chunks of a scene", "upload the scene"))
+        raise DeviceError(self.unsupported_message("cache chunks of a scene", "upload the scene"))
 
     def termination_depths(self, images: Any) -> TerminationDepths:
         """Depth at which blending of each tile stopped, of a frame with the effect `termination_depths`."""
-        raise DeviceError(self.lacks("report termination depths", "render without occlusion culling"))
+        raise DeviceError(
+            self.unsupported_message("report termination depths", "render without occlusion culling")
+        )
 
     def copy_tiles(self, images: Any, other: Any, tiles: np.ndarray) -> None:
         """Copy the tiles of a mask (rows, columns) bool from another frame of the same view into a frame, and
         add its `stats`. The sides of a tile must be multiples of the samples per pixel."""
-        raise DeviceError(self.lacks("copy tiles", "render without occlusion culling"))
+        raise DeviceError(self.unsupported_message("copy tiles", "render without occlusion culling"))
 
-    def differentiate(self, features: FeatureSet, config: Any = None) -> GradientPipeline:
+    def gradient_pipeline(self, features: FeatureSet, config: Any = None) -> GradientPipeline:
         """The pipeline with gradients. Raises InputError for an effect without a gradient."""
-        raise DeviceError(self.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
+        raise DeviceError(
+            self.unsupported_message("have gradients", "use device='opencl', 'warp' or 'reference'")
+        )
 
     def compile_in_background(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
-        """Start to compile the gradients of these features; `differentiate` waits for the compiler."""
+        """Start to compile the gradients of these features; `gradient_pipeline` waits for the compiler."""
 
     def training(self) -> Any:
         """The compiled kernels of a training step except rendering (`opencl.training.OpenCLTraining`)."""
-        raise DeviceError(self.lacks("have kernels for training", "train in NumPy"))
+        raise DeviceError(self.unsupported_message("have kernels for training", "train in NumPy"))
 
     def alignment(self) -> AlignmentKernels:
         """The compiled kernels of direct image alignment, shared by all callers."""
-        raise DeviceError(self.lacks("have kernels for image alignment", "align in NumPy"))
+        raise DeviceError(self.unsupported_message("have kernels for image alignment", "align in NumPy"))
 
     def release_scratch(self) -> None:
         """Release the scratch buffers, so that the next frame allocates only what it needs."""
-        raise DeviceError(self.lacks("release its scratch buffers", "use an OpenCL device"))
+        raise DeviceError(self.unsupported_message("release its scratch buffers", "use an OpenCL device"))
 
     def rates(self) -> Rates:
         """Peak rates of the device, measured at each call."""
-        raise DeviceError(self.lacks("measure its rates", "use an OpenCL device"))
+        raise DeviceError(self.unsupported_message("measure its rates", "use an OpenCL device"))
 
     def probe(self) -> Probe:
-        raise DeviceError(self.lacks("allow tests of its functions", "use an OpenCL or Warp device"))
+        raise DeviceError(
+            self.unsupported_message("allow tests of its functions", "use an OpenCL or Warp device")
+        )
 
     def configs(self, kind: str) -> dict[str, Any]:
         """Alternative build constants by name, with which tests compile the same features.

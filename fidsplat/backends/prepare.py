@@ -38,31 +38,32 @@ def prepare(cloud: CloudLike, capture: Capture) -> _Prepared:
 def prepare_batch(cloud: CloudLike, views: CaptureBatch) -> tuple[FeatureSet, ViewBatch]:
     """The features that the views of a batch require, and the batch of rendered views. Raises InputError as
     `prepare`, and if the views have different effects."""
-    rendered = views.active
-    indices = np.array(rendered, np.uint32)
+    active = views.active
+    indices = np.array(active, np.uint32)
     indices.flags.writeable = False
     if len(views.captures) == 1 and views.captures[0].motion.is_still:
         features, view = prepare(cloud, views.capture(0))
         if not view.sub_frames:
             positions, groups = indices.astype(np.intp), sorted((views.groups or {}).items())
             poses = None if views.poses is None else views.poses[positions]
-            moved = {label: each[positions] for label, each in groups}
+            moved = {label: motions[positions] for label, motions in groups}
             external = views.captures[0].external_depth
             if external and external.stacked:
-                own = external if len(rendered) == len(views) else external.of_views(positions)
-                view = replace(view, external_depth=own)
+                if len(active) < len(views):
+                    external = external.of_views(positions)
+                view = replace(view, external_depth=external)
             return features, ViewBatch.of_poses(view, cloud.origin, poses, moved, indices, len(views))
-    own = [prepare(cloud, views.capture(number)) for number in range(len(views))]
-    features = own[0][0]
-    for number, (other, _) in enumerate(own):
+    prepared = [prepare(cloud, views.capture(number)) for number in range(len(views))]
+    features, first_view = prepared[0]
+    for number, (other, _) in enumerate(prepared):
         if other != features:
             differing = ", ".join(sorted(other.names ^ features.names)) or "samples or precision"
             raise InputError(
                 f"the views of a batch must have the same effects, got views 0 and {number} that differ in "
                 f"{differing}; render them in separate batches"
             )
-    every = [own[number][1] for number in rendered]
-    return features, ViewBatch.of(every or [own[0][1]], indices, len(views))
+    active_views = [prepared[number][1] for number in active]
+    return features, ViewBatch.of(active_views or [first_view], indices, len(views))
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:
@@ -81,8 +82,8 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
     if not capture.has_sub_frames:
         return full_view
     sub_frames, samples = [], capture.quality.samples
-    for top, end, middle in shutter.bands(full_view.height // samples):
-        times = shutter.times(middle)
+    for top, end, middle_time in shutter.bands(full_view.height // samples):
+        times = shutter.times(middle_time)
         for k, time in enumerate(times):
             view = at(time).rows(top * samples, end * samples)
             sub_frames.append(SubFrame(view, top * samples, 1 / len(times), k == 0, k == len(times) // 2))

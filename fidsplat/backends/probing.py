@@ -36,9 +36,9 @@ class Probe(ABC):
         multiple of 16.
 
         Returns (n,) float32: `exp` and `fast_exp` of exponents, `log` and `fast_log` of fractions, `division`
-        dividends / divisors, `sqrt` of divisors, `fma` dividends * divisors + dividends; (n,) float64 if the
-        device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest normal
-        number, and twice that.
+        dividends / divisors, `sqrt` and `reciprocal` of divisors, `fma` dividends * divisors + dividends;
+        (n,) float64 if the device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of
+        the smallest normal number, and twice that.
         """
 
     @abstractmethod

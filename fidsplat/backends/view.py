@@ -238,4 +238,4 @@ class SubFrame:
     first: bool
     """whether it is the first sub-frame of its rows"""
     middle: bool
-    """whether outputs other than rgb and alpha are from this sub-frame: number n // 2 of n"""
+    """whether this is the middle sub-frame (n // 2 of n), from which all outputs except rgb and alpha are"""

@@ -226,7 +226,7 @@ class Renderer:
         features, view = prepare(resident.data, requested)
         check_gradients(features, requested.outputs)
         with self._lock:
-            pipeline = self.backend.differentiate(with_distortion(features) if distortion else features)
+            pipeline = self.backend.gradient_pipeline(with_distortion(features) if distortion else features)
             images = pipeline.forward(resident.data, view)
         return DifferentiableFrame(images, requested, pipeline, self._lock, distortion)
 
@@ -256,7 +256,7 @@ class Renderer:
         resident = self._resident(scene)
         if not self.backend.renders_subsampled:
             raise InputError(
-                self.backend.lacks(
+                self.backend.unsupported_message(
                     "render subsets of pixels", "use device='reference', or render complete frames"
                 )
             )

@@ -118,9 +118,11 @@ class Trainer:
         if self.checkpoint is not None:
             writable_folder(self.checkpoint.parent)
         backend = self.renderer.backend
-        if not backend.has("differentiate"):
-            raise DeviceError(backend.lacks("have gradients", "use device='opencl', 'warp' or 'reference'"))
-        self._differentiate = backend.differentiate
+        if not backend.has("gradient_pipeline"):
+            raise DeviceError(
+                backend.unsupported_message("have gradients", "use device='opencl', 'warp' or 'reference'")
+            )
+        self._gradient_pipeline = backend.gradient_pipeline
         self._quality = Quality.of(self.settings.quality)
         if self.renderer.device.kind == "cpu" and "arithmetic" not in self.settings.quality:
             self._quality = self._quality.with_(arithmetic="fast")
@@ -416,7 +418,7 @@ class Trainer:
         if features != self._features:
             self._features = features
             self._compile_next(iteration, plain, surface)
-        pipeline = self._differentiate(features)
+        pipeline = self._gradient_pipeline(features)
         prepared = self._model.refined_view(pipeline, prepared, number)
         images = pipeline.forward(resident, prepared, waits)
         loss, by_rgb = self._model.loss(images, number)

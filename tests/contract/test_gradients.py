@@ -60,7 +60,7 @@ CASES = {
 
 @pytest.fixture
 def backend(renderer):
-    assert renderer.backend.has("differentiate")
+    assert renderer.backend.has("gradient_pipeline")
     return renderer.backend
 
 
@@ -123,7 +123,7 @@ def test_distortions_and_their_derivatives_are_the_references(backend):
         assert_same(backend, cloud, capture, by_distortion)
         features, view = prepare(cloud, capture)
         loaded, expected = (
-            each.differentiate(with_distortion(features))
+            each.gradient_pipeline(with_distortion(features))
             .forward(each.upload(cloud), view)
             .read("distortion", 0)
             for each in (backend, ReferenceBackend())
@@ -185,7 +185,7 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
     for name, array in first.items():
         assert array.tobytes() == again[name].tobytes(), name
     features, view = prepare(cloud, capture)
-    images = backend.differentiate(with_distortion(features)).forward(backend.upload(cloud), view)
+    images = backend.gradient_pipeline(with_distortion(features)).forward(backend.upload(cloud), view)
     drawn = {name: images.read(name, 0) for name in capture.outputs}
     frame = renderer.render(cloud, capture)
     assert all(np.array_equal(drawn[name], frame[name]) for name in drawn)
@@ -213,7 +213,7 @@ def test_frames_that_are_not_awaited_have_the_same_derivatives(backend, renderer
     taken back, and the next has enough."""
     (shape,) = backend.configs("schedule").values()
     few, crowd = random_scene(2), random_scene(2, count=3000, scale=(0.2, 1.0))
-    pipeline = backend.differentiate(with_distortion(prepare(*few)[0]), config=shape)
+    pipeline = backend.gradient_pipeline(with_distortion(prepare(*few)[0]), config=shape)
 
     def backpropagated(cloud, capture, waits):
         features, view = prepare(cloud, capture)
@@ -238,7 +238,7 @@ def test_a_cloud_outlives_what_is_under_way(renderer, backend):
     reported, (cloud, capture) = [], random_scene(6)
     weakref.finalize(cloud.quats, reported.append, "gone")
     features, view = prepare(cloud, capture)
-    gradients, resident = backend.differentiate(features), backend.upload(cloud)
+    gradients, resident = backend.gradient_pipeline(features), backend.upload(cloud)
     images = gradients.forward(resident, view)
     images.read("rgb")
     held = cl.UserEvent(backend.context)
@@ -268,7 +268,7 @@ def test_outputs_without_a_gradient_given_have_one_of_zero(backend):
 def test_derivatives_are_timed_and_another_frame_in_between_is_an_error(backend, renderer):
     cloud, capture = random_scene(6)
     features, view = prepare(cloud, capture)
-    pipeline = backend.differentiate(with_distortion(features))
+    pipeline = backend.gradient_pipeline(with_distortion(features))
     images = pipeline.forward(backend.upload(cloud), view)
     pipeline.backward(images, {})
     assert {"blend", "blend backward", "project backward"} <= images.timings.keys()

@@ -92,6 +92,6 @@ def test_what_cannot_be_refined_is_reported(renderer, tmp_path):
     with pytest.raises(InputError, match=r"fs\.train\.refine"):
         fs.marker(SPEC, mixture="refined")
     plain = fs.Renderer("reference")
-    plain.backend.differentiate = partial(Backend.differentiate, plain.backend)
+    plain.backend.gradient_pipeline = partial(Backend.gradient_pipeline, plain.backend)
     with pytest.raises(DeviceError, match="must have gradients, got reference"):
         refine(made(), plain)

@@ -163,8 +163,8 @@ def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine
     requested = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
     resident = renderer.upload(some)
     for most in (1 << 31, 1 << 18):
-        monkeypatch.setattr(memory_plan, "PART_BYTES", {})
-        monkeypatch.setattr(memory_plan, "OTHER_PART_BYTES", most)
+        monkeypatch.setattr(memory_plan, "SUB_BATCH_BYTES", {})
+        monkeypatch.setattr(memory_plan, "OTHER_SUB_BATCH_BYTES", most)
         rendered = renderer.render_batch(resident, capture, **requested)
         alone = renderer.render(resident, capture)
         for number in (0, 1, 2, 4, 5, 6):

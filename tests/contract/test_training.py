@@ -100,7 +100,7 @@ def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):
 def test_the_loss_of_distortions_does_what_it_is_for(renderer, dataset):
     """With it fragments are closer together than they were, and than without it. One disk of the scene lies
     nearly along its plane to the first camera, and reaches up to it."""
-    assert renderer.backend.has("differentiate")
+    assert renderer.backend.has("gradient_pipeline")
     after = {}
     for weight in (0.0, 10.0):
         losses = {"distortion_weight": weight, "distortion_from": 0, "densify_from": 99, "sh_degree": 0}
@@ -119,6 +119,6 @@ def distortion_of(trainer):
     for view in trainer.dataset.views:
         capture = fs.Capture(view.camera, quality="surfel")
         features, visible = prepare(resident, capture)
-        pipeline = backend.differentiate(with_distortion(features))
+        pipeline = backend.gradient_pipeline(with_distortion(features))
         results.append(pipeline.forward(resident, visible).read("distortion", 0).mean())
     return np.mean(results)

@@ -239,7 +239,7 @@ def backpropagated(renderer, device, view, resident, lanes, outputs=("rgb",)):
     capture = fs.Capture(view.camera, outputs=("rgb", "depth"), quality="surfel")
     features, visible = prepare(resident, capture)
     shape = next(iter(renderer.backend.configs("schedule").values())) if lanes == 1 else None
-    pipeline = renderer.backend.differentiate(features, shape)
+    pipeline = renderer.backend.gradient_pipeline(features, shape)
     images = pipeline.forward(resident, visible)
     loss = random_loss(features, visible)
     return device.backward_per_tile(pipeline, images, {name: loss[name] for name in outputs})
@@ -276,7 +276,7 @@ def test_a_step_by_an_outdated_frame_is_refused(renderer, views, works):
 
 
 def read(renderer, resident, name):
-    buffer = resident.part(name, 0, COUNT)
+    buffer = resident.array_in_cloud_order(name, 0, COUNT)
     array = np.empty(buffer.size // 4, np.float32)
     renderer.backend.finish()
     pyopencl.enqueue_copy(renderer.backend.queue, array, buffer)

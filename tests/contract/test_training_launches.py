@@ -263,13 +263,13 @@ def test_upcoming_kernels_are_compiled_in_the_background(renderer, dataset, monk
     """Each set of kernels before the first iteration that renders by it, and all that are rendered by."""
     begun, rendered = [], []
     backend = renderer.backend
-    differentiate = backend.differentiate
+    differentiate = backend.gradient_pipeline
     monkeypatch.setattr(
         backend, "compile_in_background", lambda features: begun.append((trainer.iteration + 1, features))
     )
     trainer = Trainer(dataset, renderer, **{**STEADY, "sh_degree": 2, **losses})
     monkeypatch.setattr(
-        trainer, "_differentiate", lambda features: rendered.append(features) or differentiate(features)
+        trainer, "_gradient_pipeline", lambda features: rendered.append(features) or differentiate(features)
     )
     trainer.run()
     expected = list(dict.fromkeys(rendered))
@@ -294,8 +294,8 @@ def test_background_compilation_returns_kernels_and_errors(renderer, dataset, mo
     monkeypatch.setattr(backend, "pipeline", seen)
     for _ in range(2):
         backend.compile_in_background(features)
-    actual = backend.differentiate(features)
-    assert backend.differentiate(features) is actual
+    actual = backend.gradient_pipeline(features)
+    assert backend.gradient_pipeline(features) is actual
     assert [thread is threading.main_thread() for thread in where] == [False, True, True]
     backend.compile_in_background(features)  # it is there
     assert len(where) == 3
@@ -308,4 +308,4 @@ def test_background_compilation_returns_kernels_and_errors(renderer, dataset, mo
     monkeypatch.setattr(backend, "pipeline", failing)
     backend.compile_in_background(features)
     with pytest.raises(fs.DeviceError, match="no compiler"):
-        backend.differentiate(features)
+        backend.gradient_pipeline(features)

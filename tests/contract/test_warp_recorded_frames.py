@@ -292,7 +292,7 @@ CROSSING = [fs.Camera.look_at(61, 43, 1.1, (0.02 * k, 0.0, 0.0), (0.0, 0.0, 3.0)
 
 def test_parts_of_a_batch_are_replayed(renderer, replayed, monkeypatch):
     """Two views at a time, each with the bits of itself alone."""
-    monkeypatch.setattr(memory_plan, "_MAX_PART_BYTES", {False: 1_300_000, True: 1_300_000})
+    monkeypatch.setattr(memory_plan, "_MAX_SUB_BATCH_BYTES", {False: 1_300_000, True: 1_300_000})
     captures, resident = [CAPTURE.with_(camera=camera) for camera in CROSSING], renderer.upload(CLOUD)
     batch = renderer.render_batch(resident, captures)
     assert [len(stack) for stack in replayed] == [2, 2, 2]

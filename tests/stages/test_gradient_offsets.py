@@ -28,7 +28,7 @@ def test_splats_have_an_offset_for_each_tile_that_lists_them(renderer):
         for cloud, side in ((WIDE, 800), (random, 300)):
             camera = fs.Camera.look_at(side, side, 1.0, (0, 0, 0), (0, 0, 3.0))
             features, view = prepare(cloud, fs.Capture(camera))
-            pipeline = backend.differentiate(features, config=shape)
+            pipeline = backend.gradient_pipeline(features, config=shape)
             images = pipeline.forward(backend.upload(cloud), view)
             pipeline.backward(images, {"rgb": np.ones((side, side, 3), np.float32)})
             frame, words = images.frame, np.empty(1, np.uint32)

@@ -161,7 +161,7 @@ def test_splats_culled_before_projection(backend, monkeypatch):
     culled = 32 * own.pool.size("unculled") // 4
     assert 4096 < culled < 9000
     assert own.pool.size("splats") == culled * pipeline.source.records["Splat"].itemsize
-    resident.part("means", 0, resident.count)
+    resident.array_in_cloud_order("means", 0, resident.count)
     assert not resident.sortable
     rendered = [rendered[0] + rendered[0][:1], [*rendered[1], pipeline.render_view(resident, views[0])]]
     for images, expected in zip(*rendered, strict=True):

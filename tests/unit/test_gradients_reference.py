@@ -172,9 +172,9 @@ def test_what_has_no_gradient_is_refused_by_name():
     for name, capture in cases.items():
         features, _ = prepare(cloud, capture)
         with pytest.raises(fs.InputError, match=name):
-            backend.differentiate(features)
+            backend.gradient_pipeline(features)
     features, view = prepare(cloud, fs.Capture(CAMERA, outputs=("rgb", "label")))
-    pipeline = backend.differentiate(features)
+    pipeline = backend.gradient_pipeline(features)
     resident = backend.upload(cloud)
     images = pipeline.forward(resident, view)
     with pytest.raises(fs.InputError, match="'label' has no gradient"):

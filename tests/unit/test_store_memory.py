@@ -49,7 +49,7 @@ def test_gathered_parts_can_begin_within_a_chunk(stores):
     gathered = backend.chunk_cache(device_chunks).gather(device_chunks.of(scene.all_chunks(), True))
     gathered.streamed = True
     actual = np.empty(130, np.float32)
-    cl.enqueue_copy(backend.queue, actual, gathered.part("opacities", 70, 200))
+    cl.enqueue_copy(backend.queue, actual, gathered.array_in_cloud_order("opacities", 70, 200))
     assert np.array_equal(actual, stores["disks"].cloud().opacities[70:200])
 
 

@@ -96,12 +96,12 @@ def test_a_missing_effect_is_an_error_that_names_both(toy):
     with pytest.raises(fs.InputError, match="device must render subsets of pixels, got toy"):
         toy.render_subsampled(2, CLOUD, CAMERA)
     with pytest.raises(fs.DeviceError, match="device must have gradients, got toy"):
-        toy.backend.differentiate(None)
+        toy.backend.gradient_pipeline(None)
     with pytest.raises(fs.InputError, match="a device that shares its arrays"):
         toy.render(CLOUD, CAMERA).device_array("rgb")
     with pytest.raises(fs.InputError, match="device must have a memory budget, got toy"):
         fs.Renderer("toy", memory_budget=1)
-    assert not toy.backend.has("differentiate")
+    assert not toy.backend.has("gradient_pipeline")
     assert not supports_float64(toy, fs.Capture(CAMERA))
 
 

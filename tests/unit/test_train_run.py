@@ -119,7 +119,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_pa
 def test_a_frame_that_exceeds_its_capacity_is_rendered_again(whole, dataset, tmp_path):
     """A device that did not wait detects the error when it reads the image: the run writes the same bytes."""
     trainer, refused = Trainer(dataset, whole[0].renderer, iterations=ITERATIONS, **QUICK), []
-    differentiate = trainer._differentiate
+    differentiate = trainer._gradient_pipeline
 
     class Narrow:
         """A pipeline in which every third image that no one waits for has too little room."""
@@ -137,7 +137,7 @@ def test_a_frame_that_exceeds_its_capacity_is_rendered_again(whole, dataset, tmp
                 raise CapacityExceeded
             return self.own.backward(images, gradients)
 
-    trainer._differentiate = Narrow
+    trainer._gradient_pipeline = Narrow
     trainer.run()
     trainer.save(tmp_path / "scene.ply")
     assert refused == list(range(0, ITERATIONS, 3))

@@ -195,7 +195,7 @@ def test_derivatives_that_cannot_be_taken_are_errors(renderer):
     cloud, capture = picture()
     backend = renderer.backend
     features, view = prepare(cloud, capture)
-    pipeline, resident = backend.differentiate(features), backend.upload(cloud)
+    pipeline, resident = backend.gradient_pipeline(features), backend.upload(cloud)
     images = pipeline.forward(resident, view)
     for wrong in (
         wp.zeros((43, 61, 3), dtype=wp.float64, device="cpu"),

@@ -277,7 +277,7 @@ class GatheredChunks(Resident):
     def memory_bytes(self) -> int:
         return self._cache.memory_bytes + super().memory_bytes
 
-    def part(self, name: str, first: int, end: int) -> cl.Buffer:
+    def array_in_cloud_order(self, name: str, first: int, end: int) -> cl.Buffer:
         row_bytes = self._row_bytes(name)
         if self.streamed:
             buffer = self._workspace.pool.scratch(f"slice of {name}", (end - first) * row_bytes)

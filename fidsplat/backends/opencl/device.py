@@ -151,7 +151,7 @@ class OpenCLBackend(Workspace, Backend):
         few = samples <= _FEW_SAMPLES * self.info.compute_units
         return small_frame_config(self.config) if few else None
 
-    def differentiate(self, features: FeatureSet, config: KernelConfig | None = None) -> OpenCLGradients:
+    def gradient_pipeline(self, features: FeatureSet, config: KernelConfig | None = None) -> OpenCLGradients:
         check_differentiable(features)
         self._background.wait(features)
         pipeline = self.pipeline(features, config)
@@ -161,7 +161,7 @@ class OpenCLBackend(Workspace, Backend):
 
     def compile_in_background(self, features: FeatureSet) -> None:
         if self._pipelines.get((features, None, self.config)) not in self._gradients:
-            self._background.begin(features, lambda: self.differentiate(features).compile_step())
+            self._background.begin(features, lambda: self.gradient_pipeline(features).compile_step())
 
     def training(self) -> OpenCLTraining:
         return OpenCLTraining(self)

@@ -226,7 +226,8 @@ class TileGradients:
             results = self._allocate_results(frame)
             if count:
                 arrays: dict[str, Any] = {
-                    name: frame.resident.part(name, 0, count) for name in pipeline.cloud_arrays
+                    name: frame.resident.array_in_cloud_order(name, 0, count)
+                    for name in pipeline.cloud_arrays
                 }
                 frame.launch(
                     "project backward", "project_backward", (count,), (_GROUP,), count=count, **arrays

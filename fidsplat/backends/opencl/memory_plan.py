@@ -2,8 +2,8 @@
 
 A frame is rendered in one piece if its buffers fit. If only its (splat, tile) pairs exceed the budget, it is
 binned and blended in ranges of tiles. As the last resort the cloud is projected in slices (ranges of
-consecutive splats), of which only visible splats are stored. A batch is rendered in parts of as many views as
-fit.
+consecutive splats), of which only visible splats are stored. A batch is rendered in sub-batches of as many
+views as fit.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ TILE_TABLES = 5
 """words per tile of bin_first and bin_local: counters, starts, cursors, order and termination depths"""
 UNIFORM_BYTES = 1 << 14
 """upper bound of the bytes of uniforms, counts and moving groups"""
-PART_BYTES = {"cpu": 1 << 28}
+SUB_BATCH_BYTES = {"cpu": 1 << 28}
 """maximum bytes of the views rendered together, without images, by kind of device; more is not faster"""
-OTHER_PART_BYTES = 1 << 31
-_PART_SAMPLES = 1 << 30
-"""maximum samples of a part of a batch; kernels use 32-bit indices for several channels of samples"""
+OTHER_SUB_BATCH_BYTES = 1 << 31
+_SUB_BATCH_SAMPLES = 1 << 30
+"""maximum samples of a sub-batch; kernels use 32-bit indices for several channels of samples"""
 _CAMERA_UNIFORMS = {"ray", "vignette_center"}
 """groups of uniforms that differ between cameras"""
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """Division of a frame, or of a part of a batch, and the bytes of its buffers."""
+    """Division of a frame or sub-batch, and the bytes of its buffers."""
 
     slice_size: int
     """number of splats that are projected at once; 0: all, without packing the visible splats"""
@@ -58,7 +58,7 @@ class MemoryPlan:
     """total bytes including the cloud; exceeded only by frames with more than `MIN_BIG` big splats"""
 
 
-class Part(NamedTuple):
+class SubBatch(NamedTuple):
     """Views [first, end) of a batch that are rendered together."""
 
     first: int
@@ -67,17 +67,19 @@ class Part(NamedTuple):
 
 
 class MemoryPlanner:
+    """Memory plans of the frames and batches of one pipeline."""
+
     def __init__(
-        self, device: Workspace, source: KernelSource, features: FeatureSet, config: KernelConfig
+        self, workspace: Workspace, source: KernelSource, features: FeatureSet, config: KernelConfig
     ) -> None:
-        self._device, self._source, self._config = device, source, config
+        self._workspace, self._source, self._config = workspace, source, config
         self._has_ray_derivatives = "ray_derivatives" in source.arguments["blend"]
         self._has_camera_uniforms = not _CAMERA_UNIFORMS.isdisjoint(source.uniform_groups)
         self._channels = 0
         for samples in (RAW, *source.sample_buffers):
             self._channels += samples.channels if samples.name in source.arguments["blend"] else 0
         resolve_rays = "rays" in source.arguments.get("resolve", {})
-        self._one_by_one = (
+        self._views_differ_beyond_struct = (
             bool(source.view_arrays) or resolve_rays or "composite_background" in source.arguments
         )
         """whether the views of a batch differ in more than the struct `View`"""
@@ -88,7 +90,7 @@ class MemoryPlanner:
     def tiles(self, view: View) -> int:
         return -(-view.width // self._config.tile_width) * -(-view.height // self._config.tile_height)
 
-    def frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
+    def plan_frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
         """Plan one view. reserved: bytes of other buffers. Raises DeviceError if it does not fit."""
         config = self._config
         resident_bytes, upload_bytes = resident.bytes_for(self._source.cloud_arrays)
@@ -108,30 +110,34 @@ class MemoryPlanner:
             columns = -(-view.width // config.tile_width) * config.tile_width
             fixed += RayBuffers.bytes_of(rasters, config.tile_height, columns, self._has_ray_derivatives)
         record = self._source.records["Splat"].itemsize
-        budget, largest = self._device.memory_budget, self._device.largest_buffer
+        budget, largest = self._workspace.memory_budget, self._workspace.largest_buffer
         return plan_of(resident.capacity, record, upload_bytes, fixed, config.binning, budget, largest)
 
-    def parts(self, resident: Resident, views: ViewBatch) -> Iterator[Part]:
-        """Divide a batch into parts that are rendered together."""
+    def plan_batch(self, resident: Resident, views: ViewBatch) -> Iterator[SubBatch]:
+        """Divide a batch into sub-batches."""
         count, other_images = len(views), (views.total - 1) * self._image_bytes(views.view)
         if not count:
             return
-        plan = self.frame(resident, views.view_at(0), other_images)
+        plan = self.plan_frame(resident, views.view_at(0), other_images)
         external = views.view.external_depth
-        batched = views.stacked and not (resident.streamed or self._one_by_one)
+        batched = views.same_uniforms and not (resident.streamed or self._views_differ_beyond_struct)
         batched = batched and not (external and external.stacked)
         if plan.slice_size or not batched or (views.camera_parameters and self._has_camera_uniforms):
             for k in range(count):
-                yield Part(k, k + 1, self.frame(resident, views.view_at(k), other_images))
+                yield SubBatch(k, k + 1, self.plan_frame(resident, views.view_at(k), other_images))
             return
         samples, tables = self._samples_and_tables(views.view)
         splat_bytes = self._source.records["Splat"].itemsize + KEY_BYTES + WINDOW_BYTES
         splat_bytes += SORT_BYTES if self._config.binning == "sort_first" else 0
         view_bytes = resident.capacity * splat_bytes + tables + 4 * self._channels * samples
-        free = min(self._device.memory_budget - plan.total + view_bytes, self._device.largest_buffer)
-        max_views = min(free, PART_BYTES.get(self._device.info.kind, OTHER_PART_BYTES)) // view_bytes
-        for first, end in even_ranges(count, max(1, min(max_views, _PART_SAMPLES // samples))):
-            yield Part(first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * view_bytes))
+        free = min(self._workspace.memory_budget - plan.total + view_bytes, self._workspace.largest_buffer)
+        max_views = (
+            min(free, SUB_BATCH_BYTES.get(self._workspace.info.kind, OTHER_SUB_BATCH_BYTES)) // view_bytes
+        )
+        for first, end in even_ranges(count, max(1, min(max_views, _SUB_BATCH_SAMPLES // samples))):
+            yield SubBatch(
+                first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * view_bytes)
+            )
 
     def _image_bytes(self, view: View) -> int:
         return 4 * self._image_channels * (view.width * view.height // view.samples**2)

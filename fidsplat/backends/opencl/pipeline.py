@@ -84,7 +84,7 @@ class OpenCLPipeline(Pipeline):
             cached = resident.cached_frames.get(key) if view.sample_rows is None else None
             if cached is not None and (images := self._replay(resident, view, cached)) is not None:
                 return images
-            plan = self._planner.frame(resident, view)
+            plan = self._planner.plan_frame(resident, view)
             if plan.slice_size and self.config.binning != "sort_first":
                 return self._in_slices().render_view(resident, view)
             frame = self._render_frame(resident, view, plan)
@@ -103,12 +103,12 @@ class OpenCLPipeline(Pipeline):
             workspace.switch_to(workspace.queue)
             acquired = acquire_images(workspace, self.features.images, views)
             images = {f"{name}_out": buffer for name, (_, buffer) in zip(self.outputs, acquired, strict=True)}
-            for first, end, plan in self._planner.parts(resident, views):
-                part = views.part(first, end)
-                pipeline = self._for_part(resident, plan, part)
+            for first, end, plan in self._planner.plan_batch(resident, views):
+                sub_batch = views.sub_batch(first, end)
+                pipeline = self._for_sub_batch(resident, plan, sub_batch)
                 size_key = pipeline, "views", resident.capacity, plan
                 workspace.pool.trim(size_key, workspace.memory_budget - plan.total)
-                frame = DeviceFrame(workspace, pipeline._commands, pipeline.config, resident, part, plan)
+                frame = DeviceFrame(workspace, pipeline._commands, pipeline.config, resident, sub_batch, plan)
                 frame.named |= images  # of the complete batch, of which these views fill a part
                 render(frame)
                 rendered.append(frame.rendered())
@@ -116,7 +116,7 @@ class OpenCLPipeline(Pipeline):
 
     def fits(self, resident: Resident, view: View) -> bool:
         try:
-            return not self._planner.frame(resident, view).slice_size
+            return not self._planner.plan_frame(resident, view).slice_size
         except DeviceError:  # too little memory even for a divided frame
             return False
 
@@ -126,7 +126,7 @@ class OpenCLPipeline(Pipeline):
         if self._is_too_small_to_vectorise(resident):
             return self._with(splats_per_item=1).render_undivided(resident, view)
         with self.workspace.rendering():
-            plan, frame = self._planner.frame(resident, view), None
+            plan, frame = self._planner.plan_frame(resident, view), None
             if not plan.slice_size:
                 frame = self._render_frame(resident, view, plan)
             if frame is None or frame.pairs > self.workspace.pair_budget:
@@ -153,7 +153,7 @@ class OpenCLPipeline(Pipeline):
                 recorded.replay_into(frame)
                 frame.recorded = recorded
                 return frame
-            plan = self._planner.frame(resident, view)
+            plan = self._planner.plan_frame(resident, view)
             self._trim(resident, view, plan)
             if plan.slice_size or not tiling.pair_capacity(workspace, self.config):
                 return self.render_undivided(resident, view)
@@ -169,7 +169,7 @@ class OpenCLPipeline(Pipeline):
     def render_again(self, resident: Resident, view: View) -> Rendered:
         """Render a frame with larger buffers, after its replay exceeded the capacity."""
         with self.workspace.rendering():
-            return self._render_frame(resident, view, self._planner.frame(resident, view)).rendered()
+            return self._render_frame(resident, view, self._planner.plan_frame(resident, view)).rendered()
 
     def _replay(self, resident: Resident, view: View, recorded: RecordedFrame) -> OpenCLImages | None:
         """Replay a cached frame for another view; None if its buffers are too small or were replaced."""
@@ -258,8 +258,8 @@ class OpenCLPipeline(Pipeline):
             return self._with(culls_first=True)
         return self
 
-    def _for_part(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
-        """The pipeline with the fastest tile binning for a part of a batch."""
+    def _for_sub_batch(self, resident: Resident, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
+        """The pipeline with the fastest tile binning for a sub-batch."""
         if self.config.binning != "bin_first":
             return self
         if plan.slice_size:

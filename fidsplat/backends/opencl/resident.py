@@ -54,8 +54,9 @@ class Resident(ResidentData):
         """Bytes of these arrays that stay on the device, and bytes per splat that each frame copies."""
 
     @abstractmethod
-    def part(self, name: str, first: int, end: int) -> cl.Buffer:
-        """The array of splats [first, end)."""
+    def array_in_cloud_order(self, name: str, first: int, end: int) -> cl.Buffer:
+        """The array of splats [first, end) in the order of the cloud. It replaces an array in Morton order
+        for good, and releases the cached command lists that read it."""
 
     def sorted_array(self, name: str) -> cl.Buffer:
         """The array of all splats in Morton order, the same for all arrays."""
@@ -128,7 +129,7 @@ class UploadedCloud(Resident):
             self._order = order
         return self._order.arrays.get(name) or self._buffer(name)
 
-    def part(self, name: str, first: int, end: int) -> cl.Buffer:
+    def array_in_cloud_order(self, name: str, first: int, end: int) -> cl.Buffer:
         self.sortable = False
         if self._order is not None:
             self._order = None

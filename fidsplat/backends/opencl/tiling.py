@@ -100,7 +100,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         if frame.config.culls_first:
             arrays, count = {name: resident.sorted_array(name) for name in names}, size
         else:
-            arrays = {name: resident.part(name, first, end) for name in names}
+            arrays = {name: resident.array_in_cloud_order(name, first, end) for name in names}
         batch = frame.config.splats_per_item
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)

@@ -71,7 +71,7 @@ class ResidentArrays(Resident):
     def bytes_for(self, names: Any) -> tuple[int, int]:
         return self.memory_bytes, 0
 
-    def part(self, name: str, first: int, end: int) -> cl.Buffer:
+    def array_in_cloud_order(self, name: str, first: int, end: int) -> cl.Buffer:
         complete = self._buffers[name]
         return self._region(complete, first, end, complete.size // max(self.count, 1))
 

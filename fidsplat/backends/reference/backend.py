@@ -80,7 +80,7 @@ class ReferenceBackend(Backend):
             raise DeviceError(why)
         return ReferencePipeline(features)
 
-    def differentiate(self, features: FeatureSet, config: None = None) -> ReferenceGradients:
+    def gradient_pipeline(self, features: FeatureSet, config: None = None) -> ReferenceGradients:
         check_differentiable(features)
         return ReferenceGradients(self.pipeline(features), features)
 

@@ -85,7 +85,7 @@ class WarpBackend(Workspace, Backend):
             self._pipelines[key] = WarpPipeline(program, self, self._launches)
         return self._pipelines[key]
 
-    def differentiate(self, features: FeatureSet, config: KernelConfig | None = None) -> WarpGradients:
+    def gradient_pipeline(self, features: FeatureSet, config: KernelConfig | None = None) -> WarpGradients:
         check_differentiable(features)
         key = (features, config or self.config)
         if key not in self._gradients:

@@ -19,7 +19,7 @@ _PROJECTED = 20
 """bytes per splat of window of tiles, sort key, number of tiles, and index as a big splat"""
 _PAIR = 12
 """bytes of a (splat, tile) pair, before and after the sort"""
-_MAX_PART_BYTES = {True: 1 << 31, False: 1 << 28}
+_MAX_SUB_BATCH_BYTES = {True: 1 << 31, False: 1 << 28}
 """maximum bytes of a part of a batch on CUDA and on the CPU; larger parts are not faster"""
 _MAX_NUMBERED = 1 << 30
 """maximum number of samples and of records of a part; kernels use 32-bit indices"""
@@ -59,16 +59,16 @@ class MemoryPlanner:
             )
         return min(workspace.pair_budget, pairs)
 
-    def parts(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
+    def plan_batch(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
         """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
         count, workspace = len(batch), self.workspace
-        if not count or not batch.stacked or (self._same_settings and batch.camera_parameters):
+        if not count or not batch.same_uniforms or (self._same_settings and batch.camera_parameters):
             return even_ranges(count, 1)
         each = resident.count * self._splat_bytes + self.sample_bytes(batch.view)
         external = batch.view.external_depth
         each += external.nbytes // count if external and external.stacked else 0
         free = workspace.memory_budget - resident.memory_bytes - reserved
         # half of the budget is for the lists
-        fitting = min(free // 2, _MAX_PART_BYTES[workspace.device.is_cuda]) // each
+        fitting = min(free // 2, _MAX_SUB_BATCH_BYTES[workspace.device.is_cuda]) // each
         numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._vec4s)
         return even_ranges(count, max(1, min(fitting, numbered)))

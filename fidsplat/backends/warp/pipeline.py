@@ -87,11 +87,11 @@ class WarpPipeline(Pipeline):
                 return images
             if len(views) < views.total:
                 images.blank()
-            for first, end in self._planner.parts(resident, views, images.nbytes):
+            for first, end in self._planner.plan_batch(resident, views, images.nbytes):
                 indices = views.batch_indices[first:end].astype(np.int32)
                 indices = wp.array(indices, dtype=wp.int32, device=device)
-                part = views.part(first, end)
-                images.rendered.append(self._render(resident, part, replace(into, indices=indices)))
+                sub_batch = views.sub_batch(first, end)
+                images.rendered.append(self._render(resident, sub_batch, replace(into, indices=indices)))
             return images
 
     def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
