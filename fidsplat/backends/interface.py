@@ -370,8 +370,9 @@ class Backend(ABC):
             self.unsupported_message("have gradients", "use device='opencl', 'warp' or 'reference'")
         )
 
-    def compile_in_background(self, features: FeatureSet) -> None:  # noqa: B027 (optional)
-        """Start to compile the gradients of these features; `gradient_pipeline` waits for the compiler."""
+    def compile_in_background(self, features: FeatureSet, refined: bool = False) -> None:  # noqa: B027 (optional)
+        """Start to compile the gradients of these features; `gradient_pipeline` waits for the
+        compiler. refined: whether training steps refine views."""
 
     def training(self) -> Any:
         """The compiled kernels of a training step except rendering (`opencl.training.OpenCLTraining`)."""

@@ -440,7 +440,8 @@ class Trainer:
             self.settings.degree_at(change), "all" if self.settings.axes == 3 else "none"
         )
         features = select(properties, surface if by_normals else plain)
-        self.renderer.backend.compile_in_background(with_distortion(features) if by_distortions else features)
+        features = with_distortion(features) if by_distortions else features
+        self.renderer.backend.compile_in_background(features, self._refinement is not None)
 
     def _checked_splats(self) -> Splats:
         self._read_losses()

@@ -265,7 +265,7 @@ def test_upcoming_kernels_are_compiled_in_the_background(renderer, dataset, monk
     backend = renderer.backend
     differentiate = backend.gradient_pipeline
     monkeypatch.setattr(
-        backend, "compile_in_background", lambda features: begun.append((trainer.iteration + 1, features))
+        backend, "compile_in_background", lambda features, _: begun.append((trainer.iteration + 1, features))
     )
     trainer = Trainer(dataset, renderer, **{**STEADY, "sh_degree": 2, **losses})
     monkeypatch.setattr(

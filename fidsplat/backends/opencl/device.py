@@ -159,9 +159,9 @@ class OpenCLBackend(Workspace, Backend):
             self._gradients[pipeline] = OpenCLGradients(pipeline)
         return self._gradients[pipeline]
 
-    def compile_in_background(self, features: FeatureSet) -> None:
+    def compile_in_background(self, features: FeatureSet, refined: bool = False) -> None:
         if self._pipelines.get((features, None, self.config)) not in self._gradients:
-            self._background.begin(features, lambda: self.gradient_pipeline(features).compile_step())
+            self._background.begin(features, lambda: self.gradient_pipeline(features).compile_step(refined))
 
     def training(self) -> OpenCLTraining:
         return OpenCLTraining(self)

@@ -40,6 +40,15 @@ _STEP_NUMBERS = (
     *(f"lr_{name}" for name in ("means", "scales", "quats", "logits", "sh", "rest")),
 )
 """numeric arguments of a step of Adam (kernels/opencl/project_step.cl)"""
+_NO_VIEW_STEP: dict[str, float] = dict.fromkeys(
+    (
+        *("view_index", "next_view", "intrinsics_row", "refine_pose", "refine_intrinsics", "refine_exposure"),
+        *("rate", "correction1", "correction2", "depth"),
+        *("exposure_rate", "exposure_correction1", "exposure_correction2"),
+    ),
+    0,
+)
+"""numeric arguments of the kernel `refine_view` that refine nothing"""
 
 
 class _Target(NamedTuple):
@@ -327,8 +336,7 @@ class OpenCLTraining:
         """Add a frame's `grad2d` and visibility to the statistics. gradients: result of
         `backward_per_tile`."""
         args = dict.fromkeys(_STEP_NUMBERS, 0.0) | {"update": 0, "sparse": 0, "add_statistics": 1}
-        gradients.pipeline.compile_step()
-        gradients.step(self._bound | args)
+        self._step(gradients, args, None if self._refinement is None else _NO_VIEW_STEP)
 
     def step(
         self,
@@ -355,10 +363,13 @@ class OpenCLTraining:
             "one_minus_beta2": 1 - hyperparameters["beta2"],
         }
         args |= {"update": 1, "sparse": int(hyperparameters["sparse"]), "add_statistics": int(statistics)}
+        self._step(gradients, args, view_step)
+
+    def _step(self, gradients: Any, args: Mapping[str, Any], view_step: Mapping[str, Any] | None) -> None:
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
         gradients.pipeline.compile_step(view_step is not None)
         if view_step is None or self._refinement is None:
-            gradients.step(self._bound | args)
+            gradients.step({**self._bound, **args})
             return
         next_record = self._refinement.device_records[view_step["next_view"]]
         gradients.step({**self._bound, **args, **view_step}, next_record)
