@@ -1,9 +1,9 @@
-"""Batch of splats in a GPU block's shared memory: records, and for each cell of the tile a list of the splats
-that may overlap it (cells.py).
+"""Staging of splats in a GPU block's shared memory: records, and for each cell of the tile a list of the
+splats that may overlap it (cells.py).
 
-Warp's tiles have no 16-byte reads, shuffles or bytes in shared memory, so that these functions are in CUDA.
+Warp's tiles have no 16-byte reads, shuffles or bytes in shared memory, so these functions are in CUDA.
 On the CPU a block is one thread: records are read from global memory, and the list of a cell is the complete
-batch.
+range of staged splats.
 """
 
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from .common import with_numbers
 from .records import RecordLayout
 
 STAGED = 128
-"""splats of a batch"""
+"""maximum number of splats that are staged at once"""
 
 
 _SHARED_MEMORY = """
@@ -66,7 +66,7 @@ _LIST_CELL = """
     unsigned char* list = reinterpret_cast<unsigned char*>(__cvta_shared_to_generic(shared_memory))
                           + 16 * (SPLATS * VEC4S + CELLS) + cell * STRIDE;
     const uint4 bits = touched[cell];
-    // words that a longer batch has left
+    // words of splats staged earlier
     const unsigned int words[4] = {
         bits.x, length > 32 ? bits.y : 0, length > 64 ? bits.z : 0, length > 96 ? bits.w : 0
     };
@@ -122,8 +122,8 @@ def alone() -> bool:
 
 
 def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespace:
-    """Make functions that stage batches of records in shared memory: shared_memory; stage, mark_cells and
-    list_cell, called for each batch; cell_splat and staged_vec4.
+    """Make functions that stage records in shared memory: shared_memory; stage, mark_cells and
+    list_cell, called after each staging; cell_splat and staged_vec4.
 
     layout: layout of the records. cells: cells per tile. items: threads of a warp per cell.
     """
@@ -160,12 +160,12 @@ def make_staging(layout: RecordLayout, cells: int, items: int) -> SimpleNamespac
 
     @wp.func_native(with_numbers(_LIST_CELL, numbers))
     def list_cell(shared_memory: wp.uint64, length: int, cell: int) -> int:
-        """Number of splats of the batch that may overlap the thread's cell; call it after `mark_cells`."""
+        """Number of staged splats that may overlap the thread's cell; call it after `mark_cells`."""
         ...
 
     @wp.func_native(with_numbers(_CELL_SPLAT, numbers))
     def cell_splat(shared_memory: wp.uint64, cell: int, k: int) -> int:
-        """Index in the batch of the k-th splat in the list of a cell."""
+        """Index among the staged splats of the k-th splat in the list of a cell."""
         ...
 
     @wp.func_native(with_numbers(_STAGED_VEC4, numbers))

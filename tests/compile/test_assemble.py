@@ -35,11 +35,11 @@ SCHEDULE_FILES = {
         *("scan", "sort", "bin", "pack", "part/tile_loop_lanes"),
         "part/resolve_fused_lanes",
         "schedule/lanes",
-        "schedule/lanes_cells",
+        "schedule/lanes_culling",
     },
     "group": {
         *("list/tiled", "tile_lists", "part/chord", "part/resolve_fused_group"),
-        *("schedule/group", "schedule/group_cells"),
+        *("schedule/group", "schedule/group_culling"),
     },
 }
 LOWPASS_FILES = {"none": {"effect/lowpass_none"}, "screen": {"effect/lowpass_screen"}}

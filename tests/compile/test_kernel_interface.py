@@ -45,7 +45,7 @@ def offsets_on(backend, source: KernelSource) -> dict[str, dict[str, int]]:
             lines.append(f"    out[{len(requested)}] = (int)({place});\n")
             requested.append((record, field))
     variables = "".join(f"    {record} of_{record};\n" for record in source.records)
-    real = f"typedef {source.scalars.real} real;\n#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n"
+    real = f"typedef {source.scalar_types.real} real;\n#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n"
     body = f"kernel void places(global int *out) {{\n{variables}{''.join(lines)}}}\n"
     program = build(backend, real + "\n".join(structs) + "\n" + body)
     actual = np.empty(len(requested), np.int32)
@@ -94,7 +94,7 @@ def test_kernels_have_the_declared_arguments(renderer, shape):
             )
             for k in range(kernel.num_args)
         ]
-        scalars = {"real": source.scalars.real, "blend_real": source.scalars.blend_real}
+        scalars = {"real": source.scalar_types.real, "blend_real": source.scalar_types.blend_real}
         declared = [
             (scalars.get(one.ctype, one.ctype) + ("*" if one.access else ""), one.name, bool(one.access))
             for one in source.arguments[name].values()

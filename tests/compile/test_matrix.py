@@ -32,7 +32,7 @@ def assert_well_formed(names, shapes=SHAPES):
         assert heads.keys() == source.arguments.keys()
         for kernel, arguments in source.arguments.items():
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]
-            real = source.scalars.blend_real
+            real = source.scalar_types.blend_real
             declared = [one.text.replace("blend_real", real) for one in arguments.values()]
             assert lines == declared, kernel
         # resolve may be fused into blend

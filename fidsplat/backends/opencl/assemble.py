@@ -30,7 +30,7 @@ from fidsplat.backends.opencl.declare import (
     Member,
     Record,
     SampleBuffer,
-    Scalars,
+    ScalarTypes,
     output_argument,
 )
 from fidsplat.backends.opencl.effect_code import EFFECT_CODE, extension_code
@@ -49,13 +49,13 @@ from fidsplat.effects.extensions import EXTENSIONS
 from fidsplat.util.errors import DeviceError
 from fidsplat.util.files import kernels_folder
 
-_LISTS = {
+_LIST_STAGES = {
     "sort_first": ("scan", "sort", "bin"),
     "bin_first": ("tile_lists",),
     "bin_local": ("tile_lists", "tile_lists_local"),
 }
 """stages of the program `lists`, by tile-binning strategy"""
-_FRAME = (
+_FRAME_STAGES = (
     "prelude",
     "math",
     "splat",
@@ -63,28 +63,35 @@ _FRAME = (
     "project",
     "pack",
     "blend",
-    "schedule/{}_cells",
+    "schedule/{}_culling",
     "schedule/{}",
     "resolve",
 )
-"""stages of the program `frame`; `{}` is the schedule; `_cells`: culling by blocks of a tile's pixels;
-`pack` is used by the strategy `sort_first` only"""
-_GRADIENTS = (
+"""stages of the program `frame`; `{}` is the schedule; `_culling`: culling of splats by cells or blocks of a
+tile; `pack` is used by the strategy `sort_first` only"""
+_GRADIENT_STAGES = (
     *("prelude", "math", "splat", "bounds", "record_gradients", "blend_backward"),
-    *("schedule/{}_cells", "schedule/{}_backward", "project_splat_backward", "project_backward"),
+    *("schedule/{}_culling", "schedule/{}_backward", "project_splat_backward", "project_backward"),
 )
-_STEP = (
+_STEP_STAGES = (
     *("prelude", "math", "splat", "bounds", "record_gradients", "project_splat_backward"),
     *("train/activation_functions", "train/adam", "project_step"),
 )
-_REFINE = "rigid_motion", "train/view_adam", "train/refine_view"
-_TRAINING = ("surface", "exposure", "activation_functions", "activate", "gather_rows", "position_noise")
+_REFINE_STAGES = "rigid_motion", "train/view_adam", "train/refine_view"
+_TRAINING_STAGES = (
+    "surface",
+    "exposure",
+    "activation_functions",
+    "activate",
+    "gather_rows",
+    "position_noise",
+)
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _HOOKS = re.compile(r"^[ \t]*//@@ (\w+)(?: \w+)?[ \t]*$", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//.*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
-# the type `blend_real` and its constants (`Scalars`); both patterns begin with a literal, which `re` finds 20
-# times as fast as a word boundary
+# the type `blend_real` and its constants (`ScalarTypes`); both patterns begin with a literal, which `re`
+# finds 20 times as fast as a word boundary
 _BLEND_CONSTANT = re.compile(r"BLEND_REAL\(([^()]+)\)")
 _BLEND_REAL = re.compile(r"blend_real(?<=\bblend_real)\b")
 _EFFECT_KERNELS = (
@@ -115,7 +122,7 @@ class KernelSource:
     """by kernel, then by the argument's name, in the order of the kernel's signature"""
     sample_buffers: tuple[SampleBuffer, ...]
     """sample buffers of the effects"""
-    scalars: Scalars
+    scalar_types: ScalarTypes
 
     @property
     def listing(self) -> str:
@@ -178,7 +185,7 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     separate = {"rays", "shutter_exposure", "shutter_rows"}
     fused = features.samples == 1 and "background_constant" in effects and separate.isdisjoint(effects)
     files = [effect.file for effect in effects.values() if effect.file]
-    files += _dialect(config, _scalars(features), features.effects)
+    files += _dialect(config, _scalar_types(features), features.effects)
     files += [*([f"part/resolve_fused_{config.schedule}.cl"] if fused else []), "part/resolve_pixel.cl"]
     if "blend_half" not in effects:
         files.append("part/blend_float.cl")
@@ -189,8 +196,8 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     if config.binning == "bin_first":
         files.append("list/tiled.cl")
     # depth keys per tile need bounds of a splat's depth in a tile, which only the pinhole has
-    keys_by_tile = {"order_pixel", "camera_pinhole"} <= effects.keys() and config.binning != "sort_first"
-    if keys_by_tile:
+    has_tile_keys = {"order_pixel", "camera_pinhole"} <= effects.keys() and config.binning != "sort_first"
+    if has_tile_keys:
         effects["tile_keys"] = EFFECT_CODE["tile_keys"]
         files.append("part/tile_keys.cl")
     if "order_pixel" in effects:
@@ -211,19 +218,19 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
         "lists": (
             "prelude",
             "math",
-            *(("splat",) if keys_by_tile else ()),
+            *(("splat",) if has_tile_keys else ()),
             "bounds",
-            *_LISTS[config.binning],
+            *_LIST_STAGES[config.binning],
         ),
         "frame": [
             stage.format(config.schedule)
-            for stage in _FRAME
+            for stage in _FRAME_STAGES
             if not (stage == "pack" and config.binning != "sort_first") and not (stage == "resolve" and fused)
         ],
     }
     constants, kernels = build_constants(features, config), kernels_of(config)
     assembler = Assembler(
-        _scalars(features), constants, files, effects.values(), features.images, fused, kernels
+        _scalar_types(features), constants, files, effects.values(), features.images, fused, kernels
     )
     return assembler.source(stages)
 
@@ -251,13 +258,13 @@ def culls_before_projection(features: FeatureSet) -> bool:
 
 
 def assemble_gradients(features: FeatureSet, config: KernelConfig) -> KernelSource:
-    return _assemble_backward("gradients", _GRADIENTS, features, config)
+    return _assemble_backward("gradients", _GRADIENT_STAGES, features, config)
 
 
 def assemble_step(features: FeatureSet, config: KernelConfig, refined: bool = False) -> KernelSource:
     """Assemble a training step: the last stage of the backward pass, fused with Adam. refined: also
     sum the gradient with respect to the camera, and refine views."""
-    stages, parts = ((*_STEP, *_REFINE), ("step_camera",)) if refined else (_STEP, ())
+    stages, parts = ((*_STEP_STAGES, *_REFINE_STAGES), ("step_camera",)) if refined else (_STEP_STAGES, ())
     return _assemble_backward("step", stages, features, config, parts)
 
 
@@ -267,21 +274,23 @@ def _assemble_backward(
     effects = effect_code_of(features) | {part: EFFECT_CODE[part] for part in parts}
     # the backward pass needs the forward text of effects, but only the derivatives of outputs
     files = [effect.file for effect in effect_code_of(replace(features, outputs=(), post_steps=())).values()]
-    files += _dialect(config, _scalars(features), features.effects)
+    files += _dialect(config, _scalar_types(features), features.effects)
     files += [effect.backward_file for effect in effects.values()]
     files += [EFFECT_CODE[part].file for part in parts]
     backward = {"BACKWARD_ITEMS": backward_items(features, config), "SEGMENT": segment_size(features, config)}
     if name == "step":
         backward["AXES"] = 3 if "thickness" in effects else 2
     constants = build_constants(features, config) | backward
-    assembler = Assembler(_scalars(features), constants, files, effects.values(), kernels=kernels_of(config))
+    assembler = Assembler(
+        _scalar_types(features), constants, files, effects.values(), kernels=kernels_of(config)
+    )
     return assembler.source({name: [stage.format(config.schedule) for stage in stages]})
 
 
-def _dialect(config: KernelConfig, scalars: Scalars, effects: Iterable[str] = ()) -> list[str]:
+def _dialect(config: KernelConfig, scalar_types: ScalarTypes, effects: Iterable[str] = ()) -> list[str]:
     """Files with a vendor's instructions for float32 fragments: one for all frames, then the files of
     effects."""
-    if not config.dialect or scalars.blend_real != "float":
+    if not config.dialect or scalar_types.blend_real != "float":
         return []
     suffixes = {"arithmetic_approximate": "_exp", "blend_half": "_half"}
     return [
@@ -299,11 +308,11 @@ def kernels_of(config: KernelConfig) -> Mapping[str, tuple[Argument, ...]]:
 @cache
 def assemble_training(lanes: int, float64: bool, fast_fma: bool) -> KernelSource:
     """Assemble the kernels of loss, regularisation and optimiser, for vectors of `lanes` floats."""
-    files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING)
+    files = ("loss_values", "loss" if lanes == 1 else "loss_strips", *_TRAINING_STAGES)
     constants = {"LANES": lanes, "FAST_FMA": int(fast_fma and lanes > 1), "PROJECTION_FP64": int(float64)}
-    scalars = Scalars("double" if float64 else "float", "float")
+    scalar_types = ScalarTypes("double" if float64 else "float", "float")
     stages = ("prelude", "math", *(f"train/{file}" for file in files))
-    return Assembler(scalars, constants).source({"training": stages})
+    return Assembler(scalar_types, constants).source({"training": stages})
 
 
 @cache
@@ -312,7 +321,7 @@ def assemble_alignment(items: int) -> KernelSource:
     constants: dict[str, int | str] = {"ITEMS": items, "FIRST_BIN": alignment.FIRST_BIN}
     for name in ("HUBER", "TUKEY", "MIN_NOISE", "MAX_NOISE"):
         constants[name] = f"{getattr(alignment, name)}f"
-    return Assembler(Scalars("float", "float"), constants).source({"alignment": ("alignment",)})
+    return Assembler(ScalarTypes("float", "float"), constants).source({"alignment": ("alignment",)})
 
 
 @cache
@@ -322,18 +331,20 @@ def assemble_alignment_step(float64: bool) -> KernelSource:
         **{"PROJECTION_FP64": int(float64)},
         **{name: f"{getattr(alignment, name)}f" for name in ("MIN_GAIN", "MAX_GAIN")},
     }
-    scalars = Scalars("double" if float64 else "float", "float")
-    return Assembler(scalars, constants).source({"alignment": ("prelude", "rigid_motion", "alignment_step")})
+    scalar_types = ScalarTypes("double" if float64 else "float", "float")
+    return Assembler(scalar_types, constants).source(
+        {"alignment": ("prelude", "rigid_motion", "alignment_step")}
+    )
 
 
 def assemble_test(file: str, config: KernelConfig, float64: bool, effects: Iterable[str] = ()) -> str:
     """Text of prelude.cl, math.cl and a file of test kernels below kernels/opencl/ (empty: no file). effects:
     files whose sections fill the hooks."""
     constants = {"LANES": config.lanes, "FAST_FMA": int(config.fast_fma), "PROJECTION_FP64": int(float64)}
-    scalars = Scalars("double" if float64 else "float", "float")
+    scalar_types = ScalarTypes("double" if float64 else "float", "float")
     stages = ("prelude", "math", *([file.removesuffix(".cl")] if file else ()))
-    files = [*effects, *_dialect(config, scalars)]
-    return Assembler(scalars, constants, files).source({"check": stages}).text
+    files = [*effects, *_dialect(config, scalar_types)]
+    return Assembler(scalar_types, constants, files).source({"check": stages}).text
 
 
 def backward_items(features: FeatureSet, config: KernelConfig) -> int:
@@ -351,9 +362,9 @@ def segment_size(features: FeatureSet, config: KernelConfig) -> int:
     return backward_items(features, config) // config.tile_width
 
 
-def _scalars(features: FeatureSet) -> Scalars:
+def _scalar_types(features: FeatureSet) -> ScalarTypes:
     real = "double" if features.projection_precision == "float64" else "float"
-    return Scalars(real, "double" if "blend_double" in features.effects else "float")
+    return ScalarTypes(real, "double" if "blend_double" in features.effects else "float")
 
 
 def build_constants(features: FeatureSet, config: KernelConfig) -> dict[str, int]:
@@ -383,7 +394,7 @@ class Assembler:
 
     def __init__(
         self,
-        scalars: Scalars,
+        scalar_types: ScalarTypes,
         defines: Mapping[str, int | str],
         files: Iterable[str] = (),
         effects: Iterable[EffectCode] = (),
@@ -393,7 +404,7 @@ class Assembler:
     ) -> None:
         """files: effect files below kernels/opencl/, in the order in which they fill a hook. fused: whether
         the blend kernel also resolves, with the arguments of both."""
-        self._scalars, self._defines, self._effects = scalars, defines, list(effects)
+        self._scalar_types, self._defines, self._effects = scalar_types, defines, list(effects)
         self._outputs, self._fused, self._kernels = outputs, fused, kernels
         self._sections = {file: sections_of(file) for file in files if file}
         self._sample_buffers: tuple[SampleBuffer, ...] = ()
@@ -410,7 +421,7 @@ class Assembler:
             bounds = bounds.with_members(effect.bounds)
             record_gradient = record_gradient.with_members(effect.record_gradient)
         # as many padding fields as in `RecordGradient`
-        alignment = record_gradient.alignment // 4 * scalars.dtype("real").itemsize
+        alignment = record_gradient.alignment // 4 * scalar_types.dtype("real").itemsize
         fields = tuple(chain.from_iterable(member.names for member in record_gradient.members))
         totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
         splat = splat.without({**self._constants, **self._packed})
@@ -422,7 +433,7 @@ class Assembler:
         """Assemble programs from their stages, by the names of the programs."""
         texts = {name: self._program(name, stages) for name, stages in programs.items()}
         return KernelSource(
-            texts, self._used_structs, self._used_arguments, self._sample_buffers, self._scalars
+            texts, self._used_structs, self._used_arguments, self._sample_buffers, self._scalar_types
         )
 
     def _program(self, name: str, stages: Iterable[str]) -> ProgramSource:
@@ -458,7 +469,7 @@ class Assembler:
         text = f'#line 1 "kernel_interface.py: {subject}"\n'
         if kind == "struct":
             record = self._structs[subject]
-            self._used_structs[subject] = dtype = record.dtype(self._scalars)
+            self._used_structs[subject] = dtype = record.dtype(self._scalar_types)
             return text + record.text(dtype.itemsize)
         arguments = self._arguments(subject)
         if kind == "arguments":
@@ -497,7 +508,7 @@ class Assembler:
 
     def _with_values(self, text: str) -> str:
         """Replace the type `blend_real` and fields of `Splat` that are not stored as such in kernel text."""
-        constants, packed, real = self._constants, self._packed, self._scalars.blend_real
+        constants, packed, real = self._constants, self._packed, self._scalar_types.blend_real
         if constants:  # reads become the values; writes are removed
             names = "|".join(constants)
             text = re.sub(rf"\brecord\.(?:{names}) = [^;\n]*;", "", text)

@@ -39,7 +39,7 @@ def member(declaration: str, note: str = "") -> Member:
 
 
 @dataclass(frozen=True)
-class Scalars:
+class ScalarTypes:
     """The C types that depend on the build."""
 
     real: str
@@ -72,11 +72,11 @@ class Record:
                 members.append(Member(member.ctype, fields, member.note))
         return Record(self.name, tuple(members), self.alignment)
 
-    def dtype(self, scalars: Scalars) -> np.dtype:
+    def dtype(self, scalar_types: ScalarTypes) -> np.dtype:
         """The C layout, by natural alignment."""
         fields = []
         for member in self.members:
-            dtype = scalars.dtype(member.ctype)
+            dtype = scalar_types.dtype(member.ctype)
             fields += [
                 (name, dtype, (length,)) if length > 1 else (name, dtype) for name, length in member.names
             ]

@@ -1,7 +1,8 @@
 """Kernel code of effects and outputs: their files, and additions to structs and kernel arguments.
 
-The type of the projection is `real`, of blending `blend_real` (declare.Scalars). D is the denominator of the
-ray-splat intersection, the anchor the origin of a splat's sample coordinates (kernel_interface.SPLAT).
+The projection computes in the type `real`, blending in `blend_real` (declare.ScalarTypes). D is the
+denominator of the ray-splat intersection, the anchor the origin of a splat's sample coordinates
+(kernel_interface.SPLAT).
 
 Buffers are (channels, rows, columns) of the padded sample grid, unless a note has another shape.
 """
@@ -147,9 +148,8 @@ EFFECT_CODE: dict[str, EffectCode] = {
     ),
     "arithmetic_precise": EffectCode("effect/arithmetic_precise.cl"),
     "arithmetic_fast": EffectCode("effect/arithmetic_fast.cl"),
-    "arithmetic_approximate": EffectCode(
-        "effect/arithmetic_fast.cl"
-    ),  # where no dialect has its instructions
+    # devices without a vendor dialect render `approximate` as `fast`
+    "arithmetic_approximate": EffectCode("effect/arithmetic_fast.cl"),
     "motion_groups": EffectCode(
         "effect/motion_groups.cl",
         project=args("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),

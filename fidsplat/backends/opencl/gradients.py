@@ -113,7 +113,7 @@ class OpenCLGradients(GradientPipeline):
         frame.commands, frame.source = self._tile_commands, self.source
         frame.scratch("gradient_offsets", 4 * frame.resident.count)
         frame.scratch("record_gradients", self.source.records["RecordGradient"].itemsize * frame.pairs)
-        frame.scratch("background_sums", 3 * self.source.scalars.dtype("real").itemsize * frame.tiles)
+        frame.scratch("background_sums", 3 * self.source.scalar_types.dtype("real").itemsize * frame.tiles)
         return frame
 
     def _submit_blend_backward(self, frame: DeviceFrame, gradients: Mapping[str, Any]) -> None:
@@ -270,7 +270,7 @@ class TileGradients:
 
     @contextmanager
     def _latest_frame(self) -> Iterator[None]:
-        """A context that uses the device. Raises InputError after a later frame of the device."""
+        """Lock the device. Raises InputError if it has rendered another frame since."""
         if not self._images.is_latest:
             raise InputError(NOT_LATEST_FRAME)
         with self._frame.workspace.lock, self._frame.workspace.device_errors(_DOING):
@@ -279,7 +279,7 @@ class TileGradients:
     def _allocate_camera_sums(self, frame: DeviceFrame) -> int:
         """Allocate the sums of work-groups for the camera, and return the number of work-groups."""
         groups = -(-frame.resident.count // _GROUP)
-        real = self.pipeline.source.scalars.dtype("real").itemsize
+        real = self.pipeline.source.scalar_types.dtype("real").itemsize
         frame.scratch("camera_sums", _CAMERA * real * groups)
         return groups
 

@@ -1,6 +1,6 @@
 """Structs and kernel arguments, declared once for host and kernels.
 
-The projection computes in the type `real`, blending in `blend_real`: float or double (declare.Scalars).
+The projection computes in the type `real`, blending in `blend_real`: float or double (declare.ScalarTypes).
 
 assemble.py prints them as C into kernels/opencl/, and the host binds arguments by name. Buffers are
 (channels, rows, columns) of the padded sample grid, unless a note has another shape.
@@ -100,7 +100,7 @@ _TILES = args("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _
 _RESERVED = args(
     *("uint count", "in uint keys", _TILES),
     "out uint gradient_offsets  // (n) first gradient buffer offset of each splat, which has one per tile",
-    "out uint reserved  // number of offsets",
+    "out uint reserved  // (2) number of reserved gradient buffer offsets, number of claimed tiles",
 )
 
 _BLENDED = args(
@@ -223,7 +223,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_gradients": args(
         *(
             _RESERVED,
-            "out uint big_rows  // (rows of tiles, big splats): plus a column = index of the splat's tile",
+            "out uint big_rows  // (rows of tiles, big splats) tile_rank of column 0; add the column",
         )
     ),
     "blend_backward": args(
@@ -240,7 +240,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float record_gradients  // records RecordGradient by gradient buffer offset",
         "out real background_sums  // (tiles, 3) with respect to the background",
         "out float tapes  // a Tape for each work-item",
-        "out uint reserved  // second word: number of claimed tiles",
+        "out uint reserved  // (2) number of reserved gradient buffer offsets, number of claimed tiles",
     ),
     "project_backward": args(
         *("uint count", "in View view", "cloud float means quats scales opacities"),

@@ -30,7 +30,7 @@ class MortonOrder:
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         queue, allocate = workspace.queue, workspace.pool.allocate
         self.arrays = {"splat_ids": allocate("the cloud's order", 4 * self._count)}
-        """`splat_ids` (n,) int32, indices of the sorted splats in the cloud; then the arrays of `bound`"""
+        """`splat_ids` (n,) int32, indices of the sorted splats in the cloud; `spheres` and `max_scales`"""
         low, high = np.nanquantile(means[:: self._count // _SAMPLE + 1], (0.01, 0.99), axis=0)
         grid = *low.astype(np.float32), np.float32(_SIDE / max(*(high - low), 1e-9))
         cells, starts = allocate("cells", 4 * _SIDE**3), np.zeros(_SIDE**3, np.uint32)
@@ -62,7 +62,7 @@ class MortonOrder:
         )
         return gathered
 
-    def bound(self, arrays: Mapping[str, cl.Buffer]) -> None:
+    def compute_bounding_spheres(self, arrays: Mapping[str, cl.Buffer]) -> None:
         """Compute the bounding spheres of all groups, `spheres` (groups, 4), and `max_scales` (groups,)."""
         optional = ("thickness", "boxes")
         inputs = [arrays.get(name, arrays["scales"]) for name in ("means", "scales", "opacities", *optional)]

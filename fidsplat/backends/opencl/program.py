@@ -85,7 +85,7 @@ class Program:
         for kernel, arguments in source.arguments.items():
             self.types[kernel] = types = []
             for argument in arguments.values():
-                types.append(None if argument.access else source.scalars.dtype(argument.ctype).type)
+                types.append(None if argument.access else source.scalar_types.dtype(argument.ctype).type)
 
 
 def _compile(workspace: Workspace, source: KernelSource) -> dict[str, cl.Program]:

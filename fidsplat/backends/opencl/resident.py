@@ -125,7 +125,7 @@ class UploadedCloud(Resident):
             order = MortonOrder(self._workspace, self._array("means"), self._buffer("means"))
             for other, buffer in self._buffers.items():
                 self._buffers[other] = order.gather(other, buffer, self._bytes_of([other]))
-            order.bound(self._buffers)
+            order.compute_bounding_spheres(self._buffers)
             self._order = order
         return self._order.arrays.get(name) or self._buffer(name)
 

@@ -90,7 +90,7 @@ static inline Layer no_layer(void) {
     blend_real until = INFINITY;      // behind it no fragment belongs to this pass; infinite until all layers are complete
     bool complete = false;
 //@ staged
-        // splats of groups have batches of their own; all work-items branch alike
+        // splats of groups are staged alone; all work-items branch alike
         if (staged[0].splat.group >= 0) {
             if (!pixels[0].layers)
                 for (int row = 0; row < ROWS; row++) layers_start(&pixels[row], layers + row);

@@ -172,12 +172,12 @@ static inline void k_buffer_insert(Pixel *pixel, blend_real nearest, blend_real 
     k_buffer->until = INFINITY;
     k_buffer->bounded = true;        // in another pass (for other pixels), a pixel that dropped nothing skips all fragments
     repeats = VMASK(k_buffer->from < INFINITY);
-//@ batch_open
+//@ staged_open
             && staged[0].splat.nearest <= pixels[row].k_buffer.until      // else the buffer is full of nearer fragments
 //@ pass_from
     from = fmax(from, pixel->k_buffer.from);
 //@ layer_passed
         if (ready) k_buffer->from = -INFINITY;
 //@ blend_arguments
-                                , splats, lists[batch + which], lists[batch + which]
+                                , splats, lists[staged_start + which], lists[staged_start + which]
                                 , staged[k + 1 < listed ? cell_splats[cell][k + 1] : length - 1].splat.nearest

@@ -64,12 +64,12 @@ static inline uint min_key(const int *keys, uint blocks) {
 }
 
 // Inserts `taken` distinct keys, at most SEGMENT, into the `count` sorted keys of `deferred`, largest first. Returns the new count.
-static inline int insert_deferred(ulong *deferred, int count, const ulong *batch, int taken) {
+static inline int insert_deferred(ulong *deferred, int count, const ulong *new_keys, int taken) {
     ulong sorted[SEGMENT];
     for (int k = 0; k < taken; k++) {
         int before = 0;
-        for (int other = 0; other < taken; other++) before += batch[other] > batch[k];
-        sorted[before] = batch[k];
+        for (int other = 0; other < taken; other++) before += new_keys[other] > new_keys[k];
+        sorted[before] = new_keys[k];
     }
     int old = count - 1, own = taken - 1;
     for (int to = count + taken - 1; own >= 0; to--)
@@ -123,18 +123,18 @@ static inline int insert_deferred(ulong *deferred, int count, const ulong *batch
         }
         // splats behind by their centre: test the minimum depth in this tile
         if (reads && (ordered || behind > DEFER_THRESHOLD)) {
-            ulong batch[SEGMENT];
+            ulong new_keys[SEGMENT];
             int taken = 0, far = 0;
             for (uint which = 0; which < length; which++) {
                 const uint blocks = (uint)touched[which] & alive;
                 if (blocks == 0) continue;
                 const uint min_depth = min_key(keys[which], blocks);
                 far += min_depth >= rounded_key(rest_nearest);
-                batch[taken++] = (ulong)min_depth << 32 | positions[which];
+                new_keys[taken++] = (ulong)min_depth << 32 | positions[which];
             }
             if (ordered || far > DEFER_THRESHOLD) {
                 ordered = true;
-                deferred_count = insert_deferred(deferred, deferred_count, batch, taken);
+                deferred_count = insert_deferred(deferred, deferred_count, new_keys, taken);
                 continue;
             }
         }

@@ -36,26 +36,26 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 
     uint base = starts[first_tile], start = starts[tile] - base, end = starts[tile + 1] - base;
 //@@ pass
-    for (uint batch = start, length; batch < end; batch += length) {
-        length = min(end - batch, (uint)STAGED);
+    for (uint staged_start = start, length; staged_start < end; staged_start += length) {
+        length = min(end - staged_start, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
         // in vectors, so that neighbouring work-items read consecutive memory
         for (uint word = item; word < length * VECTORS; word += GROUP) {
             uint which = word / VECTORS, part = word % VECTORS;
-            staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
+            staged[which].words[part] = ((global const float4 *)(splats + lists[staged_start + which]))[part];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
 //@@ staged
         for (int row = 0; row < ROWS; row++)
             if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)
-//@@ batch_open
+//@@ staged_open
             ) alive = 1;
         find_cells(staged, length, x0, y0, &constants, cells, touched
 //@@ cells_arguments
         );
         barrier(CLK_LOCAL_MEM_FENCE);
-        // uniform: all work-items read the same vote, taken before this batch is blended
+        // uniform: all work-items read the same vote, taken before these splats are blended
 //@@ voted
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, cell_item, length, touched[cell], cell_splats[cell]);
@@ -63,7 +63,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         bool unfinished = false;
         for (int row = 0; row < ROWS; row++)
             unfinished |= pixel_unfinished(&pixels[row], &constants)
-//@@ batch_open
+//@@ staged_open
                 ;
         if (!unfinished) listed = 0;
         for (uint k = 0; k < listed; k++) {

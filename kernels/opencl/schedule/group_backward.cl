@@ -96,13 +96,13 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
     if (item == 0) max_reached = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    for (uint batch = start; batch < end; batch += STAGED) {
-        uint length = min(end - batch, (uint)STAGED);
+    for (uint staged_start = start; staged_start < end; staged_start += STAGED) {
+        uint length = min(end - staged_start, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
         for (uint word = item; word < length * VECTORS; word += GROUP) {
             uint which = word / VECTORS, part = word % VECTORS;
-            staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
+            staged[which].words[part] = ((global const float4 *)(splats + lists[staged_start + which]))[part];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         bool unfinished = false;
@@ -113,7 +113,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
         if (!alive) break;
         uint listed = list_cell(cells, cell_x, cell_y, cell_item, length, touched[cell], cell_splats[cell]);
         if (!unfinished) listed = 0;
-        uint beyond = (batch - start + length + SEGMENT - 1) / SEGMENT;      // number of segments up to the end of the batch
+        uint beyond = (staged_start - start + length + SEGMENT - 1) / SEGMENT;      // segments up to the end of the staged splats
         for (uint k = 0; k <= listed; k += UNROLL) {
             // evaluated in parallel, since they do not depend on transmittance; attenuation is sequential
             uint which[UNROLL];
@@ -125,7 +125,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_checkpoints
             }
             for (int next = 0; next < UNROLL; next++) {
                 // completed segments
-                for (uint to = k + next < listed ? (batch - start + which[next]) / SEGMENT : beyond; segment < to; segment++)
+                for (uint to = k + next < listed ? (staged_start - start + which[next]) / SEGMENT : beyond; segment < to; segment++)
                     for (int row = 0; row < ROWS; row++) {
                         checkpoint[(size_t)segment * PIXELS + row * TILE_W] = (float2)(transmittances[row], grad_weights[row]);
                         if (transmittances[row] > transmittance_stop) last_reached = segment + 1;

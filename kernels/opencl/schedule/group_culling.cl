@@ -94,7 +94,7 @@ static inline uint list_cell(local const uint *cells, uint cell_x, uint cell_y, 
         bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
     }
     uint first = cell_item * SHARE, rest = max(length, first) - first;
-    if (rest < SHARE) bits &= (1u << rest) - 1u;     // stale bytes of an earlier batch
+    if (rest < SHARE) bits &= (1u << rest) - 1u;     // stale bytes of splats staged earlier
     touched[cell_item] = bits;
     barrier(CLK_LOCAL_MEM_FENCE);
 #endif
