@@ -137,8 +137,8 @@ def write_chart(device: splatmark.Device, file: Path) -> None:
             labels = []
             for one in found:
                 at, name = (one["quartiles_ms"][1], one["largest_error"]), one["renderer"]
-                colour = splatmark.COLOURS[renderers.index(name) % len(splatmark.COLOURS)]
-                axes.plot(*at, "o", color=colour, label=literal(name))
+                color = splatmark.COLORS[renderers.index(name) % len(splatmark.COLORS)]
+                axes.plot(*at, "o", color=color, label=literal(name))
                 labels.append((*at, one["setting"] if name.startswith("fidsplat") else name))
             points.append(labels)
             axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame")

@@ -45,9 +45,9 @@ def cloud(seed: int, count: int = 1500, degree: int | None = None, largest: floa
     scales = np.exp(rng.uniform(math.log(largest / 25), math.log(largest), (count, 2)))
     terms = 1 if degree is None else (degree + 1) ** 2
     shades = rng.random((count, 3)) if degree is None else rng.normal(0, 0.4, (count, terms, 3))
-    colours = {"colors" if degree is None else "sh": shades.astype(np.float32)}
+    colors = {"colors" if degree is None else "sh": shades.astype(np.float32)}
     opacities, labels = rng.uniform(0.02, 1, count), np.arange(count, dtype=np.int32) // 300
-    return fs.SplatCloud(means, rng.normal(size=(count, 4)), scales, opacities, labels=labels, **colours)
+    return fs.SplatCloud(means, rng.normal(size=(count, 4)), scales, opacities, labels=labels, **colors)
 
 
 def in_coplanar_groups(splats: fs.SplatCloud) -> fs.SplatCloud:

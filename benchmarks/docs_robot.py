@@ -70,11 +70,11 @@ def floor_plan(arguments: Drive, paths: list[np.ndarray], height: int) -> np.nda
         cv2.rectangle(sheet, pixel(0, y + half), pixel(house.length, y - half), WOOD, -1)
     for tag in arguments.tags.values():
         cv2.circle(sheet, pixel(*tag.pose[:2, 3]), 2, TAG, -1, cv2.LINE_AA)
-    for number, ((name, colour), way) in enumerate(zip(WAYS.items(), paths, strict=True)):
+    for number, ((name, color), way) in enumerate(zip(WAYS.items(), paths, strict=True)):
         points = np.array([pixel(x, y) for x, y in way[::5]], np.int32)
-        cv2.polylines(sheet, [points], False, colour, 4 if number == 0 else 1, cv2.LINE_AA)
+        cv2.polylines(sheet, [points], False, color, 4 if number == 0 else 1, cv2.LINE_AA)
         foot = height - 44 + 16 * number
-        cv2.line(sheet, (12, foot - 4), (34, foot - 4), colour, 3)
+        cv2.line(sheet, (12, foot - 4), (34, foot - 4), color, 3)
         cv2.putText(sheet, name, (42, foot), cv2.FONT_HERSHEY_SIMPLEX, 0.42, TAG, 1, cv2.LINE_AA)
     cv2.circle(sheet, pixel(*paths[0][-1]), 4, TAG, -1, cv2.LINE_AA)
     return sheet

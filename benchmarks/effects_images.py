@@ -21,10 +21,10 @@ from rich.progress import track
 import fidsplat as fs
 from fidsplat.images.files import to_uint8
 from fidsplat.images.visualize import (
-    colour_counts,
-    colour_depth,
-    colour_labels,
-    colour_normals,
+    color_counts,
+    color_depth,
+    color_labels,
+    color_normals,
     contact_sheet,
     count_key,
     depth_key,
@@ -155,9 +155,9 @@ def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
     depth, distance = frame["depth"], frame["distance"]
     span = depth_span([depth, distance])
     rows = [
-        [("rgb", to_uint8(frame["rgb"])), ("normal", colour_normals(frame["normal"]))],
-        [("depth", colour_depth(depth, span)), ("distance", colour_depth(distance, span))],
-        [("label", colour_labels(frame["label"])), ("blended (splats)", colour_counts(frame["blended"]))],
+        [("rgb", to_uint8(frame["rgb"])), ("normal", color_normals(frame["normal"]))],
+        [("depth", color_depth(depth, span)), ("distance", color_depth(distance, span))],
+        [("label", color_labels(frame["label"])), ("blended (splats)", color_counts(frame["blended"]))],
     ]
     most = int(frame["blended"].max())
     keys = (normal_key, partial(depth_key, span), partial(count_key, most))

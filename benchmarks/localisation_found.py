@@ -105,8 +105,8 @@ def scene_of(seed, indoors):
     means = np.concatenate([means, objects + random.normal(0, 0.12, objects.shape)])
     scales = np.concatenate([random.uniform(0.02, 0.08, (9000, 2)), random.uniform(0.01, 0.05, (1500, 2))])
     quats = np.concatenate([quats, random.normal(size=(1500, 4))])
-    colours = random.uniform(0, 0.5, means.shape) + 0.5 * np.sin(means @ random.normal(size=(3, 3)) * 3) ** 2
-    return fs.Scene([fs.SplatCloud(means, quats, scales, np.full(len(means), 0.97), colors=colours)])
+    colors = random.uniform(0, 0.5, means.shape) + 0.5 * np.sin(means @ random.normal(size=(3, 3)) * 3) ** 2
+    return fs.Scene([fs.SplatCloud(means, quats, scales, np.full(len(means), 0.97), colors=colors)])
 
 
 def camera_of(random, indoors, width):
@@ -122,12 +122,12 @@ def camera_of(random, indoors, width):
     return fs.Camera.look_at(width, width * 3 // 4, math.radians(70), eye, eye + towards, (0, 0, 1))
 
 
-def changed(scene, random, moved, colour, size, missing):
+def changed(scene, random, moved, color, size, missing):
     """The splats of a scene with changes; missing: without 15 % of them."""
     splats = scene.splats
     kept = random.random(len(splats)) > 0.15 * missing
     count = int(kept.sum())
-    factors = 1 + colour * random.normal(size=(count, 1))
+    factors = 1 + color * random.normal(size=(count, 1))
     return fs.SplatCloud(
         splats.means[kept] + moved * random.normal(size=(count, 3)),
         splats.quats[kept],

@@ -30,7 +30,7 @@ LIMIT = 1 / 255
 SMALLEST = 1e-8
 """smaller errors are plotted here"""
 SERIES = {"splats": "splats", "pixels": "pixels", "size": "size of splats"}
-COLOURS = ("#00798c", "#d1495b", "#edae49", "#30638e", "#7b4f9d", "#2e8b57", "#c26a2d", "#777777", "#1f2d3d")
+COLORS = ("#00798c", "#d1495b", "#edae49", "#30638e", "#7b4f9d", "#2e8b57", "#c26a2d", "#777777", "#1f2d3d")
 
 
 @dataclass(frozen=True)
@@ -215,12 +215,12 @@ def svg(results: list[dict[str, Any]], renderers: Sequence[str]) -> str:
     parts.append(line('class="limit"', x(math.log10(LIMIT)), 8, x(math.log10(LIMIT)), base))
     parts.append(text((left + width) / 2, height - 4, "middle", "largest error; ms"))
     for one, at_x, at_y in zip(results, xs, ys, strict=True):
-        colour = COLOURS[renderers.index(one["renderer"]) % len(COLOURS)]
+        color = COLORS[renderers.index(one["renderer"]) % len(COLORS)]
         low_ms, middle, high_ms = one["quartiles_ms"]
         about = f"{one['renderer']}, {one['setting']}: {ms(middle)} ms ({ms(low_ms)} to {ms(high_ms)}), "
         about += f"error {one['largest_error']:.2g}, mean {one['mean_error']:.2g}, {one['psnr_db']:.1f} dB"
-        bar = line(f'stroke="{colour}"', x(at_x), y(math.log10(low_ms)), x(at_x), y(math.log10(high_ms)))
-        dot = f'<circle cx="{x(at_x):.1f}" cy="{y(at_y):.1f}" r="4.5" fill="{colour}"/>'
+        bar = line(f'stroke="{color}"', x(at_x), y(math.log10(low_ms)), x(at_x), y(math.log10(high_ms)))
+        dot = f'<circle cx="{x(at_x):.1f}" cy="{y(at_y):.1f}" r="4.5" fill="{color}"/>'
         parts.append(f"<g>{bar}{dot}<title>{escape(about)}</title></g>")
     return "".join([*parts, "</svg>"])
 
@@ -263,7 +263,7 @@ def page(files: Sequence[Path]) -> str:
         scaling=scaling,
         first_setting=first_setting,
         series=SERIES,
-        colours=COLOURS,
+        colors=COLORS,
         ms=ms,
         files=[(file.name, json.loads(file.read_text("utf-8"))) for file in files],
         markup=Markup,

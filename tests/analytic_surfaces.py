@@ -28,18 +28,18 @@ def plane(point, normal, half=1.0, step=0.05) -> fs.SplatCloud:
     return _disks(means, np.tile(normal, (len(means), 1)), step)
 
 
-def sphere(centre, radius, count=2000) -> fs.SplatCloud:
+def sphere(center, radius, count=2000) -> fs.SplatCloud:
     """Disks on a sphere, evenly by the golden angle."""
     k = np.arange(count)
     z = 1 - (2 * k + 1) / count
     angle, across = np.pi * (1 + 5**0.5) * k, np.sqrt(1 - z * z)
     normals = np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
-    return _disks(centre + radius * normals, normals, 1.3 * radius * np.sqrt(4 * np.pi / count) / 2)
+    return _disks(center + radius * normals, normals, 1.3 * radius * np.sqrt(4 * np.pi / count) / 2)
 
 
-def leaves(centre, spread, count, scale=0.02, seed=1) -> fs.SplatCloud:
+def leaves(center, spread, count, scale=0.02, seed=1) -> fs.SplatCloud:
     """Disks of random places and directions."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return _disks(centre + spread * rng.normal(size=(count, 3)), normals, scale, color=(0.1, 0.5, 0.1))
+    return _disks(center + spread * rng.normal(size=(count, 3)), normals, scale, color=(0.1, 0.5, 0.1))

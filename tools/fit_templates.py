@@ -181,7 +181,7 @@ class Layout:
         owner = np.repeat(np.arange(len(pieces)), n)
         self.slot = np.arange(len(owner)) + np.repeat(first[kind] - (np.cumsum(n) - n), n)
         self.upright = (aspect < 1)[owner]
-        self.centre = ((pieces[:, :2] + pieces[:, 2:]) / 2)[owner]
+        self.center = ((pieces[:, :2] + pieces[:, 2:]) / 2)[owner]
         self.half = ((pieces[:, 2:] - pieces[:, :2]) / 2)[owner]
         self.light = 1.0 - self.grid[boxes[:, 1], boxes[:, 0]][source[owner]]
 
@@ -199,7 +199,7 @@ class Layout:
     def _placed(self, slots: np.ndarray) -> np.ndarray:
         t = slots[self.slot]
         t = np.where(self.upright[:, None], t[:, [1, 0, 3, 2, 4]], t)
-        return np.column_stack([self.centre + self.half * t[:, :2], self.half * t[:, 2:4], t[:, 4]])
+        return np.column_stack([self.center + self.half * t[:, :2], self.half * t[:, 2:4], t[:, 4]])
 
     def freeze(self, slots: np.ndarray) -> None:
         """Compute the pairs of splats and samples, and the orders, for one round, with a margin for larger

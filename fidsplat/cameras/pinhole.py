@@ -342,7 +342,7 @@ class Camera(PickledByFields, Summarised):
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
 
     @property
-    def pixel_centres(self) -> np.ndarray:
+    def pixel_centers(self) -> np.ndarray:
         """Pixel coordinates x, y of the centres of all pixels, (h, w, 2) float64."""
         y, x = np.mgrid[0.5 : self.height, 0.5 : self.width]
         return np.stack([x, y], -1)

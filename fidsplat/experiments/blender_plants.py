@@ -54,13 +54,13 @@ def material():
     leaf.use_nodes = True
     tree = leaf.node_tree
     tree.nodes.clear()
-    colour = tree.nodes.new("ShaderNodeVertexColor")
-    colour.layer_name = "surface"
+    color = tree.nodes.new("ShaderNodeVertexColor")
+    color.layer_name = "surface"
     output, mixed = tree.nodes.new("ShaderNodeOutputMaterial"), tree.nodes.new("ShaderNodeMixShader")
     mixed.inputs[0].default_value = 0.3
     for place, kind in ((1, "ShaderNodeBsdfDiffuse"), (2, "ShaderNodeBsdfTranslucent")):
         shader = tree.nodes.new(kind)
-        tree.links.new(colour.outputs["Color"], shader.inputs["Color"])
+        tree.links.new(color.outputs["Color"], shader.inputs["Color"])
         tree.links.new(shader.outputs[0], mixed.inputs[place])
     tree.links.new(mixed.outputs[0], output.inputs["Surface"])
     return leaf

@@ -35,7 +35,7 @@ _STYLE: dict[Any, Any] = {
     "grid.color": "#dddddd",
     "grid.linewidth": 0.6,
 }
-COLOURS = (
+COLORS = (
     *("#777777", "#d1495b", "#edae49", "#00798c", "#30638e"),
     *("#7b4f9d", "#2e8b57", "#1f2d3d", "#c26a2d", "#a9c5a0"),
 )
@@ -76,7 +76,7 @@ def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logari
     width = 0.84 / max(1, len(series))
     for number, (name, values) in enumerate(series.items()):
         places = np.arange(len(groups)) - 0.42 + width * (number + 0.5)
-        axes.bar(places, values, 0.92 * width, label=literal(name), color=COLOURS[number % len(COLOURS)])
+        axes.bar(places, values, 0.92 * width, label=literal(name), color=COLORS[number % len(COLORS)])
     axes.set_xticks(range(len(groups)), list(map(literal, groups)))
     axes.grid(axis="x", visible=False)
     if logarithmic:

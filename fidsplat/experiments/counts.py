@@ -27,7 +27,7 @@ def measure_counts(point: dict, seed: int) -> dict:
     y, x0, x1, _ = runs(grid)
     by_runs = np.stack([x0, y, x1, y + 1], 1)
     boxes = {"cells": _cells(grid), "runs": by_runs, "rectangles": plain.boxes}
-    result: dict = {name: _by_colour(grid, found) for name, found in boxes.items()}
+    result: dict = {name: _by_color(grid, found) for name, found in boxes.items()}
     first = np.zeros(plain.components, int)
     first[plain.labels.ravel()] = grid.ravel()
     result["components"] = {"dark": int(first.sum()), "light": int(plain.components - first.sum())}
@@ -48,7 +48,7 @@ def _cells(grid: np.ndarray) -> np.ndarray:
     return np.stack([x, y, x + 1, y + 1], 1)
 
 
-def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
+def _by_color(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
     dark = int(grid[boxes[:, 1], boxes[:, 0]].sum())
     return {"dark": dark, "light": len(boxes) - dark}
 

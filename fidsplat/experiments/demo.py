@@ -17,8 +17,8 @@ from fidsplat.formats import save_ply
 from fidsplat.formats.files import load_splats
 from fidsplat.images.files import to_uint8, write_png
 from fidsplat.images.visualize import (
-    colour_depth,
-    colour_normals,
+    color_depth,
+    color_normals,
     contact_sheet,
     depth_key,
     depth_span,
@@ -218,8 +218,8 @@ def _sheet(views: list[DemoView]) -> np.ndarray:
     span = depth_span(view.images["depth"] for view in views)
     rows = [
         [(f"{view.name}: what was read", view.outlined) for view in views],
-        [(f"{view.name}: depth", colour_depth(view.images["depth"], span)) for view in views],
-        [(f"{view.name}: normals", colour_normals(view.images["normal"])) for view in views],
+        [(f"{view.name}: depth", color_depth(view.images["depth"], span)) for view in views],
+        [(f"{view.name}: normals", color_normals(view.images["normal"])) for view in views],
     ]
     keys = (lambda height: None, lambda height: depth_key(span, height), normal_key)
     return contact_sheet(rows, width=560, key=lambda row, height: keys[row](height))

@@ -68,6 +68,6 @@ def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, i
 
 def _depth(pose: np.ndarray, camera: Camera) -> np.ndarray:
     """Depth along z of a marker's plane at each pixel, (h, w) metres."""
-    rays = camera.rays(camera.pixel_centres.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
+    rays = camera.rays(camera.pixel_centers.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
     with np.errstate(divide="ignore"):
         return pose[:3, 2] @ pose[:3, 3] / (rays @ pose[:3, 2])

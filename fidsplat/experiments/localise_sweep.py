@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from fidsplat.cameras import Trajectory
-from fidsplat.experiments.charts import COLOURS, chart, legend_above
+from fidsplat.experiments.charts import COLORS, chart, legend_above
 from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Drive, Variant, record, recorded
 from fidsplat.experiments.pages import fixed, write_page
 from fidsplat.experiments.summary import Table
@@ -159,12 +159,12 @@ def _write_chart(folder: Path, variants: VariantResults) -> None:
         speeds = [VARIANTS[name].speed for name in variants]
         for number, name in enumerate([_truth(None if None in speeds else speeds[0]), *shown]):
             path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every 0.2 s
-            width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])
-            axes[0].plot(path[:, 0], path[:, 1], label=name, color=colour, linewidth=width)
+            width, color = (3.0, "#bbbbbb") if number == 0 else (1.0, COLORS[number % len(COLORS)])
+            axes[0].plot(path[:, 0], path[:, 1], label=name, color=color, linewidth=width)
         axes[0].set_aspect("equal")
         axes[0].set_xlabel("x [m]")
         axes[0].set_ylabel("y [m]")
-        axes[1].barh(list(errors)[::-1], list(errors.values())[::-1], color=COLOURS[4])
+        axes[1].barh(list(errors)[::-1], list(errors.values())[::-1], color=COLORS[4])
         axes[1].set_xscale("log")
         axes[1].set_xlabel("absolute trajectory error [cm]")
         axes[1].grid(axis="y", visible=False)

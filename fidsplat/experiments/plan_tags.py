@@ -470,7 +470,7 @@ def write_plan(plan: Plan, folder: Path, size: float) -> list[Path]:
 def _write_map(plan: Plan, file: Path, size: float) -> None:
     """Write a map of trajectory and tags from above, with a chart of the predicted error by number of
     tags."""
-    from fidsplat.experiments.charts import COLOURS, chart, plain_ticks
+    from fidsplat.experiments.charts import COLORS, chart, plain_ticks
     from fidsplat.splats.statistics import level_rotation
 
     level = level_rotation(scene_up(plan.scene))
@@ -480,14 +480,14 @@ def _write_map(plan: Plan, file: Path, size: float) -> None:
         axes[0].plot(path[:, 0], path[:, 1], color="#bbbbbb", linewidth=2.0)
         for tag in plan.tags:
             (x, y), normal = tag.pose[:3, 3] @ flat, -tag.pose[:3, 2] @ flat
-            axes[0].plot([x, x + 2 * size * normal[0]], [y, y + 2 * size * normal[1]], color=COLOURS[4])
-            axes[0].plot([x], [y], "s", color=COLOURS[4], markersize=4)
+            axes[0].plot([x, x + 2 * size * normal[0]], [y, y + 2 * size * normal[1]], color=COLORS[4])
+            axes[0].plot([x], [y], "s", color=COLORS[4], markersize=4)
             axes[0].annotate(
                 str(tag.marker.id), (x, y), fontsize=7, xytext=(3, 3), textcoords="offset points"
             )
         axes[0].set_aspect("equal", adjustable="datalim")
         axes[0].set_xlabel("[m], from above")
-        axes[1].plot(range(len(plan.errors)), 100 * np.array(plan.errors), marker="o", color=COLOURS[4])
+        axes[1].plot(range(len(plan.errors)), 100 * np.array(plan.errors), marker="o", color=COLORS[4])
         axes[1].set_yscale("log")
         plain_ticks(axes[1].yaxis)
         axes[1].set_xlabel("tags")

@@ -329,7 +329,7 @@ def _counts_rows(record: Record) -> Rows:
         row |= {"amount": len(seconds), "gaussians": numbers["rectangles"]}
         row |= {f"gaussians_of_{name}": numbers.get(name) for name in ("runs", "cells")}
         for name in ("components", "cells", "runs", "rectangles"):
-            row |= {f"{name}_{colour}": result[name][colour] for colour in ("dark", "light")}
+            row |= {f"{name}_{color}": result[name][color] for color in ("dark", "light")}
         spread = statistics.stdev(seconds) if len(seconds) > 1 else 0.0
         yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
 

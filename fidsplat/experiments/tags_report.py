@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from fidsplat.experiments.charts import COLOURS, chart, legend_above
+from fidsplat.experiments.charts import COLORS, chart, legend_above
 from fidsplat.experiments.pages import NOTHING, page_and_folder, write_page
 from fidsplat.experiments.summary import Summary, Table, summarise
 from fidsplat.experiments.sweep import Record
@@ -198,15 +198,15 @@ def _curves(rates: Table, causes: Sequence[str], file: Path) -> None:
             for number, detector in enumerate(detectors):
                 selected = rates[(rates["family"] == family) & (rates["detector"] == detector)]
                 selected = selected[selected["cause"].isin((cause, NONE))].sort_values("severity")
-                colour = COLOURS[number % len(COLOURS)]
+                color = COLORS[number % len(COLORS)]
                 x = selected["severity"].to_numpy()
                 label = detector if place is axes[0] else None
                 if not len(selected):
-                    place.plot([], [], color=colour, label=label)
+                    place.plot([], [], color=color, label=label)
                     continue
-                place.plot(x, 100 * selected["rate"].to_numpy(), color=colour, label=label, linewidth=1.3)
+                place.plot(x, 100 * selected["rate"].to_numpy(), color=color, label=label, linewidth=1.3)
                 low, high = (100 * selected[f"rate_{end}"].to_numpy() for end in ("low", "high"))
-                place.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
+                place.fill_between(x, low, high, color=color, alpha=0.12, linewidth=0)
             place.set_xticks([0.0, 0.5, 1.0], ["", "", ""])
             place.set_ylim(-4, 104)
             if family == families[0]:

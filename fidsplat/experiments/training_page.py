@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from fidsplat.experiments.charts import COLOURS, chart
+from fidsplat.experiments.charts import COLORS, chart
 from fidsplat.experiments.pages import fixed, page_and_folder, write_page
 from fidsplat.images.files import write_png
 from fidsplat.train import Trainer, TrainingView, ViewScore
@@ -62,8 +62,8 @@ def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
     """Write charts of loss, training PSNR and number of splats over the iterations."""
     panels = (("losses", "loss"), ("psnrs", "PSNR of the view, dB"), ("counts", "splats"))
     with chart(file, panels=len(panels), size=(9.0, 3.0), one_scale=False) as (_, axes):
-        for (name, title), axis, colour in zip(panels, axes, COLOURS[1:], strict=False):
-            axis.plot(*_means(history[name]), color=colour)
+        for (name, title), axis, color in zip(panels, axes, COLORS[1:], strict=False):
+            axis.plot(*_means(history[name]), color=color)
             axis.set(title=title, xlabel="iteration")
 
 

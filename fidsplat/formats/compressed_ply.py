@@ -38,11 +38,11 @@ def compressed_rows(header: Header) -> Rows:
     n = header.elements["vertex"].count
     _check(header, "vertex", _PACKED, "<u4", n)
     limits = [f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
-    colour_limits = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+    color_limits = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     _check(header, "chunk", limits, "<f4", -(-n // CHUNK))
-    coloured = any(name in header.elements["chunk"].properties for name in colour_limits)
-    if coloured:
-        _check(header, "chunk", colour_limits, "<f4", -(-n // CHUNK))
+    colored = any(name in header.elements["chunk"].properties for name in color_limits)
+    if colored:
+        _check(header, "chunk", color_limits, "<f4", -(-n // CHUNK))
     rest = len(header.elements["sh"].properties) if "sh" in header.elements else 0
     if rest:
         _check(header, "sh", [f"f_rest_{i}" for i in range(rest)], "|u1", n)
@@ -67,7 +67,7 @@ def compressed_rows(header: Header) -> Rows:
         for start in range(0, len(rows), BLOCK):  # blocks bound the size of float64 temporaries
             part = slice(start, start + BLOCK)
             owners = chunks[start // CHUNK : start // CHUNK + _CHUNKS_AT_ONCE]
-            unpacked = _unpack(rows[part], owners, coloured)
+            unpacked = _unpack(rows[part], owners, colored)
             arrays["sh"][part, 0] = unpacked.pop("dc")
             for name, values in unpacked.items():
                 arrays[name][part] = values
@@ -77,7 +77,7 @@ def compressed_rows(header: Header) -> Rows:
     return Rows(header.path, n, columns, fill)
 
 
-def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, np.ndarray]:
+def _unpack(rows: np.ndarray, chunks: np.ndarray, colored: bool) -> dict[str, np.ndarray]:
     """Decode splats of chunks to float64: means, quats, scales, opacities, and SH of degree 0, dc (k, 3)."""
     chunk_of = np.arange(len(rows)) // CHUNK
 
@@ -96,7 +96,7 @@ def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, n
         "quats": with_largest_component(three, rotations >> 30),
         "scales": np.exp(between("_scale", "xyz", scale)),
         "opacities": color[:, 3],
-        "dc": ((between("", "rgb", color[:, :3]) if coloured else color[:, :3]) - 0.5) / C0,
+        "dc": ((between("", "rgb", color[:, :3]) if colored else color[:, :3]) - 0.5) / C0,
     }
 
 

@@ -65,8 +65,8 @@ class TriangleMesh:
         if len(self.faces) <= faces:
             return self
         simplification = _package("fast_simplification")
-        centre = self.vertices.mean(0)
-        local = (self.vertices - centre).astype(np.float32)
+        center = self.vertices.mean(0)
+        local = (self.vertices - center).astype(np.float32)
         points, triangles, collapses = simplification.simplify(
             local, self.faces.astype(np.int32), target_count=faces, return_collapses=True
         )
@@ -78,7 +78,7 @@ class TriangleMesh:
             counts = np.bincount(where, minlength=len(points))[:, None]
             sums = np.stack([np.bincount(where, colors[:, k], len(points)) for k in range(3)], 1)
             colors = sums / np.maximum(counts, 1)
-        return TriangleMesh(points + centre, triangles.astype(np.int32), colors)
+        return TriangleMesh(points + center, triangles.astype(np.int32), colors)
 
     def convex_parts(self, max_parts: int) -> list[TriangleMesh]:
         """Approximate convex decomposition (CoACD) into at most this many parts.
@@ -88,11 +88,11 @@ class TriangleMesh:
         """
         coacd = _package("coacd")
         coacd.set_log_level("error")
-        centre = self.vertices.mean(0)
-        mesh = coacd.Mesh(self.vertices - centre, self.faces)
+        center = self.vertices.mean(0)
+        mesh = coacd.Mesh(self.vertices - center, self.faces)
         preprocess = "off" if self.closed else "auto"  # remeshing would take most of the time
         parts = coacd.run_coacd(mesh, max_convex_hull=max_parts, preprocess_mode=preprocess, seed=0)
-        return [TriangleMesh(np.asarray(v) + centre, np.asarray(f, np.int32)) for v, f in parts]
+        return [TriangleMesh(np.asarray(v) + center, np.asarray(f, np.int32)) for v, f in parts]
 
 
 def save_mesh(mesh: TriangleMesh, path: Path, parts: int = 32) -> list[Path]:

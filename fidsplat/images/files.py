@@ -149,13 +149,13 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"a marker image must be a one-bit or 8-bit PNG, got {image.dtype} pixels in {path}")
     top = np.iinfo(image.dtype).max
-    colours, alpha = image, None
+    colors, alpha = image, None
     if image.shape[2] == 4:
-        colours, alpha = image[:, :, :3], image[:, :, 3]
-        colours = np.where(alpha[:, :, None] == 0, top, colours)
-    grey = colours[:, :, 0]
+        colors, alpha = image[:, :, :3], image[:, :, 3]
+        colors = np.where(alpha[:, :, None] == 0, top, colors)
+    grey = colors[:, :, 0]
     levels = np.unique(grey)
-    if (colours != grey[:, :, None]).any():
+    if (colors != grey[:, :, None]).any():
         raise InputError(f"a marker image must be black and white, got colours in {path}; threshold it first")
     if len(levels) > 2:
         raise InputError(

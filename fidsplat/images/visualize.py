@@ -23,7 +23,7 @@ def depth_span(depths: Iterable[np.ndarray]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def colour_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> np.ndarray:
+def color_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> np.ndarray:
     """Colour a depth image (h, w) with the turbo map, near red and far blue; black for 0 and not finite.
 
     span: depths in metres of the first and the last colour; default: `depth_span` of this image.
@@ -35,11 +35,11 @@ def colour_depth(depth: np.ndarray, span: tuple[float, float] | None = None) -> 
 
 
 def depth_key(span: tuple[float, float], height: int) -> np.ndarray:
-    """Colour bar of `colour_depth` with its range in metres, (height, KEY_WIDTH, 3)."""
+    """Colour bar of `color_depth` with its range in metres, (height, KEY_WIDTH, 3)."""
     low, high = span
     digits = max(0, 2 - math.floor(math.log10(max(high, 1e-9))))
     words = [f"{low + fraction * (high - low):.{min(digits, 6)}f} m" for fraction in _TICKS]
-    return _colour_bar(height, lambda fraction: 1 - fraction, words)
+    return _color_bar(height, lambda fraction: 1 - fraction, words)
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
@@ -49,14 +49,14 @@ def depth_millimetres(depth: np.ndarray) -> np.ndarray:
     return np.rint(np.clip(clean * 1000.0, 0, 65535)).astype(np.uint16)
 
 
-def colour_normals(normal: np.ndarray) -> np.ndarray:
+def color_normals(normal: np.ndarray) -> np.ndarray:
     """Colour unit normals (h, w, 3) as (n + 1) / 2; black for normals of length 0."""
     valid = (normal != 0).any(axis=2, keepdims=True)
     return np.rint(np.where(valid, np.clip((normal + 1) / 2, 0, 1), 0) * 255).astype(np.uint8)
 
 
 def normal_key(height: int) -> np.ndarray:
-    """Colour key of `colour_normals`, (height, KEY_WIDTH, 3): a sphere in the colours of its normals."""
+    """Colour key of `color_normals`, (height, KEY_WIDTH, 3): a sphere in the colours of its normals."""
     key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
     radius, middle = 34, (KEY_WIDTH // 2, height // 2)
     y, x = (np.mgrid[-radius : radius + 1, -radius : radius + 1]) / radius
@@ -64,7 +64,7 @@ def normal_key(height: int) -> np.ndarray:
     normal = np.stack([x, y, -np.sqrt(np.maximum(1 - x * x - y * y, 0))], -1)
     top, left = middle[1] - radius, middle[0] - radius
     ball = key[top : top + 2 * radius + 1, left : left + 2 * radius + 1]
-    ball[inside] = colour_normals(normal)[inside]
+    ball[inside] = color_normals(normal)[inside]
     sides = (
         ("up", 0, -radius - 12),
         ("down", 0, radius + 14),
@@ -77,22 +77,22 @@ def normal_key(height: int) -> np.ndarray:
     return key
 
 
-def colour_labels(label: np.ndarray) -> np.ndarray:
+def color_labels(label: np.ndarray) -> np.ndarray:
     """Colour labels or ids (h, w): black for -1, grey for 0, a distinct colour for each other label."""
     values, which = np.unique(label, return_inverse=True)
-    colours = _colours(values)
-    colours[values < 0], colours[values == 0] = 0, _BACKGROUND
-    return colours[which.reshape(label.shape)]
+    colors = _colors(values)
+    colors[values < 0], colors[values == 0] = 0, _BACKGROUND
+    return colors[which.reshape(label.shape)]
 
 
-def colour_counts(count: np.ndarray) -> np.ndarray:
+def color_counts(count: np.ndarray) -> np.ndarray:
     """Colour counts or errors (h, w) with the turbo map, from 0 (dark blue) to the maximum (red)."""
     return _turbo(count / (count.max(initial=0) or 1))
 
 
 def count_key(maximum: int, height: int) -> np.ndarray:
-    """Colour bar of `colour_counts` up to a maximum count, (height, KEY_WIDTH, 3)."""
-    return _colour_bar(height, lambda fraction: fraction, [f"{round(s * maximum)}" for s in _TICKS])
+    """Colour bar of `color_counts` up to a maximum count, (height, KEY_WIDTH, 3)."""
+    return _color_bar(height, lambda fraction: fraction, [f"{round(s * maximum)}" for s in _TICKS])
 
 
 def draw_outlines(
@@ -132,7 +132,7 @@ def draw_outlines(
 
 
 def write(
-    image: np.ndarray, text: str, place: tuple[int, int], colour=(255, 255, 255), size: float = 0.5
+    image: np.ndarray, text: str, place: tuple[int, int], color=(255, 255, 255), size: float = 0.5
 ) -> None:
     """Write a line of text with a dark outline into an image; `place` (x, y) is its lower left corner."""
     plain = text.encode("ascii", "replace").decode()  # OpenCV's fonts have only ASCII
@@ -140,7 +140,7 @@ def write(
     width = max(1, round(2 * size))
     # the outline is the text shifted in four directions, since OpenCV 5 widens text of a thicker stroke
     for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1), (0, 0)):
-        shade = colour if (right, down) == (0, 0) else (0, 0, 0)
+        shade = color if (right, down) == (0, 0) else (0, 0, 0)
         at = (x + right, y + down)
         cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, size, shade, width, cv2.LINE_AA)
 
@@ -187,12 +187,12 @@ def contact_sheet(
 _TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)  # positions of a colour bar's ticks, from the bottom
 
 
-def _colour_bar(height: int, colour: Callable[[np.ndarray], np.ndarray], words: list[str]) -> np.ndarray:
+def _color_bar(height: int, color: Callable[[np.ndarray], np.ndarray], words: list[str]) -> np.ndarray:
     """Colour bar with labelled ticks. colour: maps positions from 0 (bottom) to 1 to [0, 1] of the turbo
     map."""
     key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
     left, right, top, foot = 10, 34, 8, height - 9
-    key[top : foot + 1, left:right] = _turbo(colour(np.linspace(1, 0, foot + 1 - top)))[:, None].reshape(
+    key[top : foot + 1, left:right] = _turbo(color(np.linspace(1, 0, foot + 1 - top)))[:, None].reshape(
         -1, 1, 3
     )
     for fraction, word in zip(_TICKS, words, strict=True):
@@ -210,7 +210,7 @@ def _turbo(fraction: np.ndarray) -> np.ndarray:
     )
 
 
-def _colours(values: np.ndarray) -> np.ndarray:
+def _colors(values: np.ndarray) -> np.ndarray:
     # steps of the golden angle give neighbouring labels very different hues
     hue = (values - 1.0) * 137.508 % 360 / 2
     pixels = np.stack([hue, np.full(hue.shape, 200.0), np.full(hue.shape, 255.0)], -1).astype(np.uint8)

@@ -117,7 +117,7 @@ def _deviations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Maximum distances of rectangles from a surface: (n,), and (n, 2) along the rectangles' axes."""
     module, middle = printed.module, np.array(printed.grid.shape[::-1]) / 2
-    centre = ((boxes[:, :2] + boxes[:, 2:]) / 2 - middle) * module
+    center = ((boxes[:, :2] + boxes[:, 2:]) / 2 - middle) * module
     half = (boxes[:, 2:] - boxes[:, :2]) * (module / 2)
     offsets = np.linspace(-1, 1, SAMPLES)
     steps = np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
@@ -126,8 +126,8 @@ def _deviations(
         c, s = np.cos(printed.angles[owner])[:, None], np.sin(printed.angles[owner])[:, None]
         x, y = offset[..., 0], offset[..., 1]
         offset = np.stack([c * x - s * y, s * x + c * y], -1)
-    at = surface.frames(centre)
-    true = surface.frames((centre[:, None] + offset).reshape(-1, 2)).points.reshape(*offset.shape[:2], 3)
+    at = surface.frames(center)
+    true = surface.frames((center[:, None] + offset).reshape(-1, 2)).points.reshape(*offset.shape[:2], 3)
     flat = at.points[:, None] + offset[..., :1] * at.along_x[:, None] + offset[..., 1:] * at.along_y[:, None]
     distances = np.linalg.norm(true - flat, axis=2)
     on_axis = [distances[:, steps[:, 1 - axis] == 0].max(1) for axis in (0, 1)]

@@ -54,10 +54,10 @@ def rectangle_rings(x: float, y: float, w: float, h: float, rx: float, ry: float
     if not (rx > 0 and ry > 0):
         return [np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])]
     angle = np.linspace(0, np.pi / 2, PIECES + 1)
-    centres = ((x + w - rx, y + h - ry), (x + rx, y + h - ry), (x + rx, y + ry), (x + w - rx, y + ry))
+    centers = ((x + w - rx, y + h - ry), (x + rx, y + h - ry), (x + rx, y + ry), (x + w - rx, y + ry))
     corners = [
         np.column_stack([cx + rx * np.cos(angle + i * np.pi / 2), cy + ry * np.sin(angle + i * np.pi / 2)])
-        for i, (cx, cy) in enumerate(centres)
+        for i, (cx, cy) in enumerate(centers)
     ]
     return [np.concatenate(corners)]
 

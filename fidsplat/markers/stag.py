@@ -75,10 +75,10 @@ def _bits(spec: Spec) -> tuple[Spec, np.ndarray]:
     distances = np.linalg.norm(points[:, None] - points, axis=2)
     one, other = np.nonzero(np.triu(distances < _NEAR, 1) & dark[:, None] & dark)
 
-    def circles(centres: np.ndarray, radius: float) -> shapely.Geometry:
+    def circles(centers: np.ndarray, radius: float) -> shapely.Geometry:
         sides = 4 if radius < _DISK else 16  # of a quadrant: 1/1000 of the edge from the circle
         return shapely.union_all(
-            shapely.buffer(shapely.points(EDGE * centres), EDGE * radius, quad_segs=sides)
+            shapely.buffer(shapely.points(EDGE * centers), EDGE * radius, quad_segs=sides)
         )
 
     light, code = circles(points[~dark], _CODE), circles(points[dark], _CODE)

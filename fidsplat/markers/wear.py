@@ -187,13 +187,13 @@ def _coarse(sheet: Sheet, severity: float, rng: np.random.Generator) -> Sheet:
     """Print in square dots, each in the colour of the sheet at the dot's centre."""
     dot = DOT * severity * sheet.cells
 
-    def centres(count: int) -> np.ndarray:
+    def centers(count: int) -> np.ndarray:
         """Cell at the centre of the dot of each cell along an edge."""
         shift = rng.random()
         number = np.floor((np.arange(count) + 0.5) / dot + shift)
         return np.clip(np.floor((number + 0.5 - shift) * dot), 0, count - 1).astype(int)
 
-    dots = np.ix_(*map(centres, sheet.present.shape))
+    dots = np.ix_(*map(centers, sheet.present.shape))
     return sheet._replace(color=sheet.color[dots], present=sheet.present & sheet.present[dots])
 
 

@@ -98,13 +98,13 @@ class _Environment:
     def casters(self, light: Light, surface: ReceiverPoints) -> tuple[Any, float]:
         """Upload the splats that may shadow a surface from a light, in black. Returns them (None if there
         are none) and their largest distance [m] from the middle of the surface, at most 1 km."""
-        centres, radii = self.spheres
-        casters = np.arange(len(centres))
+        centers, radii = self.spheres
+        casters = np.arange(len(centers))
         if self.scene.motion.is_still:
-            casters = shadow_casters(light, surface, centres, radii)
+            casters = shadow_casters(light, surface, centers, radii)
         if not len(casters):
             return None, 0.0
-        distances = np.linalg.norm(centres[casters] - surface.middle, axis=1) + radii[casters]
+        distances = np.linalg.norm(centers[casters] - surface.middle, axis=1) + radii[casters]
         black = _rebuilt(self.scene.cloud(), casters, colors=np.zeros((len(casters), 3), np.float32))
         return self.renderer.upload(black), float(min(distances.max(), 1e3))
 

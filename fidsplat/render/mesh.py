@@ -88,7 +88,7 @@ def scene_mesh(
 
 def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
     """Cosine (h, w) float32 of the angle between the rays and the normals (h, w, 3), at least 0.1."""
-    pixels = camera.pixel_centres.reshape(-1, 2)
+    pixels = camera.pixel_centers.reshape(-1, 2)
     origins, points = (camera.unproject(pixels, np.full(len(pixels), depth)) for depth in (0.0, 1.0))
     rays = ((points - origins) @ camera.world_to_camera[:3, :3].T).reshape(normal.shape)
     cosine = -(normal * rays).sum(2) / np.linalg.norm(rays, axis=2)

@@ -8,10 +8,10 @@ import numpy as np
 from fidsplat.effects import declared_output
 from fidsplat.images.files import write_png
 from fidsplat.images.visualize import (
-    colour_counts,
-    colour_depth,
-    colour_labels,
-    colour_normals,
+    color_counts,
+    color_depth,
+    color_labels,
+    color_normals,
     depth_millimetres,
 )
 from fidsplat.util.errors import InputError
@@ -20,10 +20,10 @@ from fidsplat.util.npy import load_npy
 
 _VISUALISATIONS = {
     "color": lambda image: image,
-    "depth": colour_depth,
-    "normal": colour_normals,
-    "label": colour_labels,
-    "count": colour_counts,
+    "depth": color_depth,
+    "normal": color_normals,
+    "label": color_labels,
+    "count": color_counts,
 }
 """8-bit visualisation of an output image, by `Output.display`"""
 

@@ -98,14 +98,14 @@ def light_points(light: Light, middle: np.ndarray) -> list[LightPoint]:
 
 
 def shadow_casters(
-    light: Light, surface: ReceiverPoints, centres: np.ndarray, radii: np.ndarray
+    light: Light, surface: ReceiverPoints, centers: np.ndarray, radii: np.ndarray
 ) -> np.ndarray:
     """Rows of the spheres, centres (n, 3) and radii (n,), that may cast shadows on a surface: in front of the
     surface, and inside the capsule from the surface to the light (a cone for a sun)."""
     # heights are dot products with `normal`, which is not a unit vector
     middle, normal = surface.middle, surface.normals.mean(axis=0)
     radius = surface.radius + _MARGIN * surface.pitch
-    length, offsets = float(np.linalg.norm(normal)), centres - middle
+    length, offsets = float(np.linalg.norm(normal)), centers - middle
     receivers = surface.positions + surface.clearance * surface.normals
     min_height = ((receivers - middle) @ normal).min() - surface.pitch
     if isinstance(light, Sun):
@@ -187,7 +187,7 @@ def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
     pixels, value = pixels[inside], value[inside]
     plane = np.linalg.lstsq(_affine(pixels), value, rcond=None)[0]
     height, width = camera.height, camera.width
-    image = (_affine(camera.pixel_centres.reshape(-1, 2)) @ plane).reshape(height, width)
+    image = (_affine(camera.pixel_centers.reshape(-1, 2)) @ plane).reshape(height, width)
     residual = value - _affine(pixels) @ plane
     if len(residual) and np.abs(residual).max() > 1e-6 * np.abs(value).max():  # a curved surface
         column, row = np.clip(pixels.astype(int), 0, (width - 1, height - 1)).T

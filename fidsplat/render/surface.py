@@ -192,9 +192,9 @@ def _radius_in_metres(camera: Camera, pixel: tuple[float, float], radius_px: flo
 def _fit_patch(
     depth: np.ndarray, camera: Camera, pixel: tuple[float, float], radius_px: float, radius_m: float
 ) -> Surface:
-    centres = camera.pixel_centres
-    mask = ((centres - pixel) ** 2).sum(2) <= max(radius_px, 1.0) ** 2
+    centers = camera.pixel_centers
+    mask = ((centers - pixel) ** 2).sum(2) <= max(radius_px, 1.0) ** 2
     depths = depth[mask].astype(np.float64)
-    points = camera.unproject(centres[mask], np.where(depths > 0, depths, np.nan))
+    points = camera.unproject(centers[mask], np.where(depths > 0, depths, np.nan))
     origin, further = camera.unproject(np.array([pixel, pixel]), np.array([0.0, 1.0]))
     return fit_surface(points, origin, further - origin, radius_m)

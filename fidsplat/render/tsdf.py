@@ -61,8 +61,8 @@ class DistanceField:
         rotation, size = camera.world_to_camera[:3, :3], BLOCK_SIDE * self.voxel
         along_ray = camera.lens is not None and camera.lens.along_ray
         corners = (_blocks(self.keys) * size + self.origin - camera.position) @ rotation.T
-        centres = corners + (size / 2) * rotation.sum(1)
-        in_front = np.flatnonzero((centres[:, 2] > -size) | along_ray)
+        centers = corners + (size / 2) * rotation.sum(1)
+        in_front = np.flatnonzero((centers[:, 2] > -size) | along_ray)
         steps = (_VOXELS + 0.5) * self.voxel @ rotation.T
         for start in range(0, len(in_front), BLOCKS_AT_ONCE):
             interrupts.check()

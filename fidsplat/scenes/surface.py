@@ -78,8 +78,8 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
     fraction = len(filled) / max(len(points), 1)
     if fraction < MIN_FRACTION or len(filled) < 3:
         raise InputError(_refusal(f"{100 - 100 * fraction:.0f} % of the patch without splats"))
-    centre = filled.mean(0)
-    local, tolerance = filled - centre, TOLERANCE * radius
+    center = filled.mean(0)
+    local, tolerance = filled - center, TOLERANCE * radius
     triples = np.random.default_rng(0).integers(0, len(local), (_TRIPLES, 3))
     a, b, c = (local[triples[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -115,7 +115,7 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
             "the surface must face the camera, got one that is parallel to the ray; give another pixel"
         )
     normal = -np.sign(slope) * normal
-    distance = float((centre + middle - origin) @ normal) / -abs(slope)
+    distance = float((center + middle - origin) @ normal) / -abs(slope)
     rms = float(np.sqrt(np.mean(residuals[inside] ** 2)))
     return Surface(origin + distance * ray, normal, fraction, rms, float(radius))
 

@@ -217,19 +217,19 @@ def b7(renderer: Renderer) -> Found:
     yield Finding("sum of the normals of both sides", float(np.abs(sum(normals)).max()), 1e-6)
 
 
-def _centred() -> SplatCloud:
+def _centered() -> SplatCloud:
     return splats([[0, 0, 2]], FACING, (0.3, 0.2), 0.9)
 
 
 @case("B8", "pixel centres", "odd sizes, 1 x 1; principal point outside; 3 x 3 samples")
 def b8(renderer: Renderer) -> Found:
     for width, height in ((1, 1), (7, 5), (33, 1), (101, 79)):
-        yield FrameSpec(_centred(), camera(width, height, 30.0), outputs=ALL_OUTPUTS)
+        yield FrameSpec(_centered(), camera(width, height, 30.0), outputs=ALL_OUTPUTS)
     off_center = camera(53, 31, 60.0, cx=-20.5, cy=44.25)
     yield FrameSpec(random_splats(80, seed=2), off_center, outputs=ALL_OUTPUTS)
     yield FrameSpec(random_splats(60, seed=13), camera(47, 33, 40.0), Quality(samples=3), ALL_OUTPUTS)
     # the image of a splat on the axis is symmetric and bit-identical at odd sizes
-    frame = render(renderer, FrameSpec(_centred(), camera(101, 79, 30.0), outputs=("rgb", "depth")))
+    frame = render(renderer, FrameSpec(_centered(), camera(101, 79, 30.0), outputs=("rgb", "depth")))
     for name, flip in (("left and right", np.s_[:, ::-1]), ("top and bottom", np.s_[::-1])):
         mirrored = {key: image[flip] for key, image in frame.items()}
         yield Finding(f"pixels that differ {name}", differing(frame, mirrored, frame.outputs), 0)

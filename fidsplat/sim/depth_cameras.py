@@ -261,9 +261,9 @@ class StructuredLight(DepthCamera):
         rows = np.clip(np.arange(h)[:, None] + moved[0], 0, h - 1)
         columns = np.clip(np.arange(w) + moved[1], 0, w - 1)
         # the neighbour decides which surface is matched; use the depth of that surface's plane at this pixel
-        other, centre = view.depth[rows, columns], view.depth
-        same = np.abs(other - centre) < 0.05 * centre
-        depth, valid = np.where(same, centre, other), np.where(same, valid, valid[rows, columns])
+        other, center = view.depth[rows, columns], view.depth
+        same = np.abs(other - center) < 0.05 * center
+        depth, valid = np.where(same, center, other), np.where(same, valid, valid[rows, columns])
         strength = camera.fx * self.baseline
         disparity = strength / np.where(valid, depth, 1.0) + rng.normal(0, self.noise, (h, w))
         disparity = np.rint(disparity / self.step) * self.step if self.step else disparity
@@ -302,7 +302,7 @@ def _view(renderer: Renderer, scene: Scene, camera: Camera) -> DepthView:
         scene.capture, camera=camera, motion=motion, outputs=outputs, sensor=Sensor(), fog=None
     )
     frame = renderer.render(scene, capture)
-    rays = camera.rays(camera.pixel_centres.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
+    rays = camera.rays(camera.pixel_centers.reshape(-1, 2)).reshape(camera.height, camera.width, 3)
     cosine = -(frame["normal"] * rays).sum(2) / np.linalg.norm(rays, axis=2)
     depth = frame["depth_median"].astype(np.float64)
     grey = linear_light(frame["rgb"], "srgb") @ LUMINANCE
@@ -324,7 +324,7 @@ def _projector(camera: Camera, right: float, near: float) -> Camera:
 
 def _stretch(camera: Camera) -> np.ndarray:
     """Distance along each pixel's ray per depth, (h, w)."""
-    rays = camera.rays(camera.pixel_centres.reshape(-1, 2))
+    rays = camera.rays(camera.pixel_centers.reshape(-1, 2))
     return np.linalg.norm(rays / rays[:, 2:], axis=1).reshape(camera.height, camera.width)
 
 
@@ -339,7 +339,7 @@ def _projected_to(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels x, y and depth (h, w) in another camera of the points of a depth image; cameras are parallel."""
     shift = (camera.world_to_camera - other.world_to_camera)[0, 3]
-    x, y = np.moveaxis(camera.pixel_centres, -1, 0)
+    x, y = np.moveaxis(camera.pixel_centers, -1, 0)
     moved = other.cx - camera.cx - camera.fx * shift / np.where(depth > 0, depth, math.inf)
     return x + moved, y, depth
 

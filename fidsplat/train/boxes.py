@@ -76,7 +76,7 @@ def marker_mask(box: np.ndarray, camera: Camera, margin: float) -> np.ndarray:
     corners = camera.project(np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ box[:3, :2].T + box[:3, 3])
     if not np.isfinite(corners).all():
         return np.zeros(size, bool)
-    x, y = np.moveaxis(camera.pixel_centres, -1, 0)
+    x, y = np.moveaxis(camera.pixel_centers, -1, 0)
     inside = np.ones(size, bool)
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, 0), strict=True):
         length = max(float(np.hypot(x1 - x0, y1 - y0)), 1e-9)

@@ -249,13 +249,13 @@ def alignment(cameras: Sequence[Camera], targets: Sequence[Camera]) -> np.ndarra
         for one, other in zip(cameras, targets, strict=True)
     ]
     rotation = nearest_rotation(np.sum([other.T @ one for one, other in pairs], axis=0))
-    centres, goals = (np.array([camera.position for camera in each]) for each in (cameras, targets))
-    spread = (centres - centres.mean(axis=0)) @ rotation.T
+    centers, goals = (np.array([camera.position for camera in each]) for each in (cameras, targets))
+    spread = (centers - centers.mean(axis=0)) @ rotation.T
     overlap = float((spread * (goals - goals.mean(axis=0))).sum())
     scale = overlap / float((spread**2).sum()) if overlap > 0 else 1.0
     matrix = np.eye(4)
     matrix[:3, :3] = scale * rotation
-    matrix[:3, 3] = goals.mean(axis=0) - matrix[:3, :3] @ centres.mean(axis=0)
+    matrix[:3, 3] = goals.mean(axis=0) - matrix[:3, :3] @ centers.mean(axis=0)
     return matrix
 
 

@@ -59,11 +59,11 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
     for equal."""
     import flip_evaluator  # type: ignore[import-not-found]  # of the extra `experiments`
 
-    def coloured(values: np.ndarray) -> np.ndarray:
+    def colored(values: np.ndarray) -> np.ndarray:
         values = np.asarray(values, np.float32)
         return np.ascontiguousarray(values if values.ndim == 3 else np.repeat(values[:, :, None], 3, axis=2))
 
-    a, b = coloured(image), coloured(truth)
+    a, b = colored(image), colored(truth)
     _, mean, _ = flip_evaluator.evaluate(b, a, "LDR", applyMagma=False, computeMeanError=True)
     return float(mean)
 

@@ -169,7 +169,7 @@ def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
             f"the depth must have the camera's shape {(camera.height, camera.width)}, got {depth.shape}"
         )
     far = np.where(depth > 0, depth, np.nan)
-    return camera.unproject(camera.pixel_centres.reshape(-1, 2), far.ravel()).reshape(*depth.shape, 3)
+    return camera.unproject(camera.pixel_centers.reshape(-1, 2), far.ravel()).reshape(*depth.shape, 3)
 
 
 def optical_flow(
@@ -208,4 +208,4 @@ def optical_flow(
             matrix, mask = np.asarray(motion, np.float64), label == value
             points[mask] = points[mask] @ matrix[:3, :3].T + matrix[:3, 3]
     moved = after.project(points.reshape(-1, 3)).reshape(*depth.shape, 2)
-    return (moved - before.pixel_centres).astype(np.float32)
+    return (moved - before.pixel_centers).astype(np.float32)

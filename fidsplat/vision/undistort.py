@@ -38,7 +38,7 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
             f"the pinhole must have the position of the image's camera, {camera.position.tolist()}, got "
             f"{pinhole.position.tolist()}"
         )
-    rays = pinhole.rays(pinhole.pixel_centres.reshape(-1, 2)) @ pinhole.world_to_camera[:3, :3]
+    rays = pinhole.rays(pinhole.pixel_centers.reshape(-1, 2)) @ pinhole.world_to_camera[:3, :3]
     at = camera.project(camera.position + rays).astype(np.float32) - np.float32(0.5)
     at = np.nan_to_num(at, nan=_NOWHERE).reshape(pinhole.height, pinhole.width, 2)
     return cv2.remap(np.ascontiguousarray(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR)

@@ -69,7 +69,7 @@ class Mesh:
         rng = np.random.default_rng(seed)
         # each quadrilateral as two triangles
         corners = np.concatenate([self.quads[:, [0, 1, 2]], self.quads[:, [0, 2, 3]]])
-        at, colour = self.vertices[corners], self.colors[corners]
+        at, color = self.vertices[corners], self.colors[corners]
         normals = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
         area = np.linalg.norm(normals, axis=1) / 2
         # stratified by area: independent samples would leave holes
@@ -84,7 +84,7 @@ class Mesh:
             at[face, 1] - at[face, 0],
             normals[face],
             np.full((count, 2), size),
-            (colour[face] * weights).sum(1),
+            (color[face] * weights).sum(1),
         )
 
 
@@ -193,8 +193,8 @@ def _plain(cloud: SplatCloud) -> SplatCloud:
     )
 
 
-def _shade(rng: np.random.Generator, colour: Sequence[float], spread: float = 0.2) -> np.ndarray:
-    return np.clip(np.asarray(colour) * (1 + rng.uniform(-spread, spread)), 0, 1)
+def _shade(rng: np.random.Generator, color: Sequence[float], spread: float = 0.2) -> np.ndarray:
+    return np.clip(np.asarray(color) * (1 + rng.uniform(-spread, spread)), 0, 1)
 
 
 def _stem(rng: np.random.Generator, height: float) -> np.ndarray:
@@ -229,7 +229,7 @@ def _placed(points: np.ndarray, at: np.ndarray, rotation: float) -> np.ndarray:
     return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + at
 
 
-def _tube(line: np.ndarray, radius: float, colour: Sequence[float]) -> Mesh:
+def _tube(line: np.ndarray, radius: float, color: Sequence[float]) -> Mesh:
     """Tapered tube along a line (n, 3), with six sides."""
     along = np.gradient(line, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -240,7 +240,7 @@ def _tube(line: np.ndarray, radius: float, colour: Sequence[float]) -> Mesh:
     ring = (
         np.cos(around)[:, None] * across[:, None] + np.sin(around)[:, None] * np.cross(along, across)[:, None]
     )
-    return _grid(line[:, None] + thick[:, None, None] * ring, np.asarray(colour), closed=True)
+    return _grid(line[:, None] + thick[:, None, None] * ring, np.asarray(color), closed=True)
 
 
 def _blade(
@@ -249,7 +249,7 @@ def _blade(
     rotation: float,
     length: float,
     wide: float,
-    colour: np.ndarray,
+    color: np.ndarray,
     rise: float = 0.35,
     droop: float = 1.0,
     lobes: float = 0.08,
@@ -266,20 +266,20 @@ def _blade(
     lift = half * (0.25 * np.abs(v) + waves * np.abs(v) ** 2 * np.sin(4 * math.pi * u + 3 * v + phase))
     points = middle + np.stack([0 * lift, half * v, lift], axis=-1)
     light = 1 + 0.18 * np.abs(v) - 0.08 * np.cos(8 * math.pi * (u - 0.3 * np.abs(v)))
-    return _grid(_placed(points, foot, rotation), np.clip(colour * light[..., None], 0, 1))
+    return _grid(_placed(points, foot, rotation), np.clip(color * light[..., None], 0, 1))
 
 
-def _ball(middle: np.ndarray, radii: Sequence[float], colour: np.ndarray) -> Mesh:
+def _ball(middle: np.ndarray, radii: Sequence[float], color: np.ndarray) -> Mesh:
     rows, columns = 9, 12
     down = np.linspace(0.02, math.pi - 0.02, rows)[:, None]
     around = np.arange(columns) * 2 * math.pi / columns
     rays = np.stack(
         [np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down) + 0 * around], -1
     )
-    return _grid(middle + rays * radii, colour, closed=True)
+    return _grid(middle + rays * radii, color, closed=True)
 
 
-def _grid(points: np.ndarray, colour: np.ndarray, closed: bool = False) -> Mesh:
+def _grid(points: np.ndarray, color: np.ndarray, closed: bool = False) -> Mesh:
     """Surface through a grid of points (rows, columns, 3). closed: whether the last column joins the
     first."""
     rows, columns = points.shape[:2]
@@ -287,7 +287,7 @@ def _grid(points: np.ndarray, colour: np.ndarray, closed: bool = False) -> Mesh:
     if closed:
         number = np.column_stack([number, number[:, 0]])
     quads = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], -1).reshape(-1, 4)
-    return Mesh(points.reshape(-1, 3), quads, np.broadcast_to(colour, points.shape).reshape(-1, 3))
+    return Mesh(points.reshape(-1, 3), quads, np.broadcast_to(color, points.shape).reshape(-1, 3))
 
 
 def _merged(parts: Sequence[Mesh]) -> Mesh:

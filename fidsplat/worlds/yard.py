@@ -149,7 +149,7 @@ def _plants(random: np.random.Generator) -> list[SplatCloud]:
     return [_shrub(random, *shrub) for shrub in shrubs]
 
 
-def _shrub(random: np.random.Generator, middle, axes, leaves: int, bushy, colour, flowers) -> SplatCloud:
+def _shrub(random: np.random.Generator, middle, axes, leaves: int, bushy, color, flowers) -> SplatCloud:
     """A shrub: leaves are disks, or thick tufts if bushy; blooms are spheres."""
     direction = random.normal(size=(leaves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -158,7 +158,7 @@ def _shrub(random: np.random.Generator, middle, axes, leaves: int, bushy, colour
     rotations = np.linalg.qr(random.normal(size=(leaves, 3, 3)))[0]
     rotations *= np.sign(np.linalg.det(rotations))[:, None, None]
     light = 0.75 + 0.35 * (-direction[:, 1:2]) + random.normal(0, 0.08, (leaves, 1))  # brighter on top
-    colors = np.asarray(colour) * light
+    colors = np.asarray(color) * light
     blooms = np.zeros(leaves, bool)
     if flowers is not None:
         blooms = random.uniform(size=leaves) < 0.12

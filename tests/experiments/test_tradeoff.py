@@ -220,8 +220,8 @@ def test_a_definition_has_a_truth_of_its_own(session):
     assert session.reference("apriltag@0", BASE) is session.reference(
         "apriltag@0", BASE.with_(alpha_cutoff=0.01)
     )
-    centre = BASE.with_(order="centre")
-    assert np.abs(session.reference("apriltag@0", BASE) - session.reference("apriltag@0", centre)).max() > 0.1
+    center = BASE.with_(order="centre")
+    assert np.abs(session.reference("apriltag@0", BASE) - session.reference("apriltag@0", center)).max() > 0.1
 
 
 @pytest.mark.sweep

@@ -59,8 +59,8 @@ def test_intersecting_splats_equal_their_composited_images(renderer, cloud):
     single = [subset_of(cloud, np.array([k])) for k in range(len(cloud))]
     got, expected = composited_parts(renderer, single, view, "pixel")
     assert np.abs(got - expected).max() < 1e-5
-    centre = composited_parts(renderer, single, view, "centre")[0]
-    assert np.abs(centre - expected).max() > 0.1
+    center = composited_parts(renderer, single, view, "centre")[0]
+    assert np.abs(center - expected).max() > 0.1
 
 
 @pytest.mark.parametrize(

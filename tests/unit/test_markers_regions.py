@@ -61,8 +61,8 @@ def test_components_holes_and_polygons(grid):
         assert number[i] == holes(part, grid.shape)
         assert shapes[i].is_valid
         assert shapes[i].area == len(part)
-        centres = shapely.points([(x + 0.5, y + 0.5) for y, x in sorted(part)])
-        assert shapely.contains(shapes[i], centres).all()
+        centers = shapely.points([(x + 0.5, y + 0.5) for y, x in sorted(part)])
+        assert shapely.contains(shapes[i], centers).all()
 
 
 def test_a_long_spiral_is_one_component():

@@ -76,8 +76,8 @@ def test_an_oblique_plane_behind_leaves():
     on_wall = np.abs(away) < 0.1
     assert np.abs(away[on_wall]).max() < 0.03 / 2
     within = np.linalg.norm(local[on_wall] - away[on_wall, None] * normal, axis=1) < 0.5
-    centres = made.vertices[made.faces].mean(1) - AT
-    middle = (np.abs(centres @ normal) < 0.1) & (np.linalg.norm(centres, axis=1) < 0.5)
+    centers = made.vertices[made.faces].mean(1) - AT
+    middle = (np.abs(centers @ normal) < 0.1) & (np.linalg.norm(centers, axis=1) < 0.5)
     crosses = made._crosses[middle]
     assert within.sum() > 500
     assert np.linalg.norm(crosses, axis=1).sum() / 2 == pytest.approx(math.pi * 0.25, rel=0.05)

@@ -63,8 +63,8 @@ def test_unproject_inverts_project(lens):
 def test_a_wall_behind_leaves(wall, renderer, lens, radius):
     """Two kinds of pixels: a leaf at the pixel itself, and none."""
     view = camera(**LENSES[lens])
-    centre = view.project(AT[None])[0]
-    for pixel in (centre, centre + np.array((18.0, -13.0))):
+    center = view.project(AT[None])[0]
+    for pixel in (center, center + np.array((18.0, -13.0))):
         surface = wall.surface_at(view, pixel, radius=radius, renderer=renderer)
         assert abs((surface.position - AT) @ NORMAL) < 1e-5
         assert angle(surface.normal, NORMAL) < 0.02

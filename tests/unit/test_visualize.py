@@ -6,9 +6,9 @@ import pytest
 
 from fidsplat.images.visualize import (
     KEY_WIDTH,
-    colour_depth,
-    colour_labels,
-    colour_normals,
+    color_depth,
+    color_labels,
+    color_normals,
     contact_sheet,
     count_key,
     depth_key,
@@ -25,20 +25,20 @@ SQUARE = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
 def test_near_is_red_far_is_blue_and_nothing_is_black():
     depth = np.linspace(1, 5, 100).reshape(1, 100)
     depth[0, 50], depth[0, 51], depth[0, 52] = 0, np.nan, np.inf
-    colours = colour_depth(depth).astype(int)
-    assert colours.shape == (1, 100, 3)
-    assert colours[0, 2, 0] > colours[0, 2, 2], "red above blue"
-    assert colours[0, 90, 2] > colours[0, 90, 0], "blue above red"
-    assert (colours[0, 50:53] == 0).all()
-    assert (colour_depth(np.zeros((3, 4))) == 0).all()
-    assert colour_depth(np.full((3, 4), 2.0)).any(), "a flat picture has a colour"
+    colors = color_depth(depth).astype(int)
+    assert colors.shape == (1, 100, 3)
+    assert colors[0, 2, 0] > colors[0, 2, 2], "red above blue"
+    assert colors[0, 90, 2] > colors[0, 90, 0], "blue above red"
+    assert (colors[0, 50:53] == 0).all()
+    assert (color_depth(np.zeros((3, 4))) == 0).all()
+    assert color_depth(np.full((3, 4), 2.0)).any(), "a flat picture has a colour"
 
 
 def test_one_stray_splat_does_not_use_up_the_colours():
     depth = np.tile(np.linspace(1, 2, 200), (10, 1))
     depth[0, 0] = 1000.0
     # stretched to 1000 m, all of the first row would be of one colour
-    assert len(np.unique(colour_depth(depth)[1], axis=0)) > 150
+    assert len(np.unique(color_depth(depth)[1], axis=0)) > 150
 
 
 def test_millimetres():
@@ -48,15 +48,15 @@ def test_millimetres():
 
 def test_normals():
     normal = np.array([[[0, 0, -1], [1, 0, 0], [0, 0, 0]]], float)
-    assert colour_normals(normal).tolist() == [[[128, 128, 0], [255, 128, 128], [0, 0, 0]]]
+    assert color_normals(normal).tolist() == [[[128, 128, 0], [255, 128, 128], [0, 0, 0]]]
 
 
 def test_labels_have_colours_of_their_own():
     label = np.array([[-1, 0, 1, 2, 3, 4, 5, 6, 7, 8]])
-    colours = [tuple(c) for c in colour_labels(label)[0].tolist()]
-    assert len(set(colours)) == 10
-    assert colours[0] == (0, 0, 0)
-    assert len(set(colours[1])) == 1
+    colors = [tuple(c) for c in color_labels(label)[0].tolist()]
+    assert len(set(colors)) == 10
+    assert colors[0] == (0, 0, 0)
+    assert len(set(colors[1])) == 1
 
 
 def test_an_outline_has_the_corners_and_keeps_the_image():
@@ -111,7 +111,7 @@ def test_keys_say_what_the_colours_mean():
     most = count_key(7, 200)
     assert (most[9, 20] == key[190, 20]).all(), "the greatest count has the colour of the nearest depth"
     ball = normal_key(200)
-    towards = colour_normals(np.array([[[0.0, 0, -1]]]))[0, 0]
+    towards = color_normals(np.array([[[0.0, 0, -1]]]))[0, 0]
     assert (ball[100, KEY_WIDTH // 2] == towards).all()
     assert ball[100, KEY_WIDTH // 2 + 30, 0] > ball[100, KEY_WIDTH // 2 - 30, 0], "red is to the right"
 

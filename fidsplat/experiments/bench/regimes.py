@@ -109,9 +109,9 @@ def huge(thick: bool) -> Views:
 def clusters(thick: bool) -> Views:
     """All splats in 12 dense clusters: few tiles have most of the work."""
     cloud, generator = random_cloud(_COUNT, _SCALE, thick=thick), np.random.default_rng(2)
-    centres = generator.uniform((-3.0, -1.5, 6.0), (3.0, 1.5, 10.0), (12, 3))
+    centers = generator.uniform((-3.0, -1.5, 6.0), (3.0, 1.5, 10.0), (12, 3))
     near = generator.normal(0.0, 0.12, (_COUNT, 3))
-    means = centres[generator.integers(0, 12, _COUNT)] + near
+    means = centers[generator.integers(0, 12, _COUNT)] + near
     return _single(_changed(cloud, means=means.astype(np.float32)), standard_camera(1280, 720))
 
 

@@ -76,13 +76,13 @@ def _plot(axes: Axes, device: DeviceResults, scene: str) -> list[tuple[float, fl
     axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame")
     axes.plot(points["ms"], points["error"], ".", color="#bbbbbb", label="every setting")
     axes.plot(cutoffs["ms"], cutoffs["error"], "-", color="#00798c", label="only the cut-off")
-    for setting, style, colour, text in (
+    for setting, style, color, text in (
         (PRESET, "o", "#d1495b", "presets"),
         ("alpha_cutoff", "o", "#00798c", None),
         (ABLATION, "s", "#edae49", "one constant in an exact image"),
     ):
         chosen = labelled[labelled["setting"] == setting]
-        axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=text)
+        axes.plot(chosen["ms"], chosen["error"], style, color=color, label=text)
     axes.axhline(INVISIBLE, color="#777777", linestyle="--", linewidth=0.8)
     axes.annotate(
         "half an 8-bit level", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
