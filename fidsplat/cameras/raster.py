@@ -33,7 +33,7 @@ class RayRaster:
     """first row in the full raster"""
 
     def rows(self, top: int, end: int) -> RayRaster:
-        """The raster of rows [top, end), with the `bounds_pyramid` of the full raster."""
+        """The raster of rows [top, end), with the `inverse_lens_lut` of the full raster."""
         return replace(self, height=end - top, center_y=self.center_y - top, full_raster=self, top=top)
 
     @cached_property
@@ -86,8 +86,8 @@ class RayRaster:
         return float(np.sqrt(np.nanmax(squared))) * 1.00001
 
     def lut_coordinates(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates (x, y) of rays in `bounds_pyramid`: in the undistorted pinhole image, in samples; for a
-        fisheye or a ray table, of the stereographic projection (X, Y) / (|ray| + Z)."""
+        """Coordinates (x, y) of rays in `inverse_lens_lut`: in the undistorted pinhole image, in samples; for
+        a fisheye or a ray table, of the stereographic projection (X, Y) / (|ray| + Z)."""
         x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
         if isinstance(self.lens, Fisheye | RayTable):
             denominator = z + np.sqrt(x * x + y * y + z * z)
@@ -95,7 +95,7 @@ class RayRaster:
         return self.focal_x * x / z + self.center_x, self.focal_y * y / z + self.center_y
 
     @cached_property
-    def bounds_pyramid(self) -> tuple[np.ndarray, np.ndarray]:
+    def inverse_lens_lut(self) -> tuple[np.ndarray, np.ndarray]:
         """Inverse lookup table of the lens, from ray directions to samples: a pyramid of grids over the
         `lut_coordinates`, from cells x cells to 1 x 1, with the bounds of each cell's samples.
 
@@ -104,7 +104,7 @@ class RayRaster:
         low_y, cells per unit along x, along y, cells) float64.
         """
         if self.full_raster is not None:
-            return self.full_raster.bounds_pyramid
+            return self.full_raster.inverse_lens_lut
         rows, columns = np.nonzero(np.isfinite(self.rays[..., 0]))
         cells = 1
         while 2 * cells <= min(MAX_CELLS, max(self.width, self.height) // 2):
@@ -132,10 +132,10 @@ class RayRaster:
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """Kernel uniforms: parameters of the lens, grid of `bounds_pyramid`, first row."""
+        """Kernel uniforms: parameters of the lens, grid of `inverse_lens_lut`, first row."""
         if self.lens.kind == "equirectangular":
             return self.lens.uniforms
-        low_x, low_y, *rest = map(float, self.bounds_pyramid[1])
+        low_x, low_y, *rest = map(float, self.inverse_lens_lut[1])
         if not isinstance(self.lens, Fisheye | RayTable):
             low_y -= self.top  # a band counts rows from its own top, the pyramid from the full raster's
         return (*self.lens.uniforms, low_x, low_y, *rest, float(self.top))

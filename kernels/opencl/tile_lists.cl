@@ -18,7 +18,7 @@ static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulon
     return exclusive;
 }
 
-// Indices in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats.
+// Indices in the buffer `frame_counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats.
 enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 
 // Class of a list by its length, 0 for the longest; there are SCAN_ITEMS classes.
@@ -33,7 +33,7 @@ static inline uint4 tile_lengths(global const uint *counters, uint first, uint e
 
 // Index space: work-groups of SCAN_ITEMS. The first one orders the tiles; each of the others computes the starts of its share of the
 // tiles. Each adds up the lengths of all lists itself, so that none waits for another.
-// Reads: counters. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts, to which `emit` adds the number of visible
+// Reads: counters. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), frame_counts, to which `emit` adds the number of visible
 // splats; tile_order[tiles]: tiles by the classes of their lists, so that blending begins with the longest, in any order within a class.
 // All lists are empty if there are more pairs than `capacity`, unless that is 2^32 - 1.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
@@ -79,10 +79,10 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     }
     if (from == 0 && item == 0) {
         starts[tiles] = fits ? (uint)pairs : 0;
-        counts[COUNT_BIG] = counters[COUNTER_BIG];
-        counts[COUNT_VISIBLE] = 0;   // added up by `emit`
-        counts[COUNT_PAIRS] = (uint)pairs;
-        counts[COUNT_PAIRS + 1] = (uint)(pairs >> 32);
+        frame_counts[COUNT_BIG] = counters[COUNTER_BIG];
+        frame_counts[COUNT_VISIBLE] = 0;   // added up by `emit`
+        frame_counts[COUNT_PAIRS] = (uint)pairs;
+        frame_counts[COUNT_PAIRS + 1] = (uint)(pairs >> 32);
     }
 }
 
@@ -207,7 +207,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void count_big(
 // Index space: for each view the same number of work-groups, which share the big splats, then `splat_groups` work-groups, one
 // work-item per splat.
 // Reads: windows, keys, starts, big, big_bounds. Reads and overwrites: cursors of the range. Writes: pairs; adds to
-// counts[COUNT_VISIBLE].
+// frame_counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
 ) {
@@ -215,7 +215,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
     local ushort queue[BIN_ITEMS * WINDOW_TILES];     // (work-item of the splat, tile of its window)
     local uint corners[BIN_ITEMS], depths[BIN_ITEMS], deferred[TEAMS][TEAM_DEFERRED + 1];
     const TileRange tile_range = {(width + TILE_W - 1) / TILE_W, first_tile, end_tile, starts[first_tile], capacity};
-    uint item = get_local_id(0), view_index = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
+    uint item = get_local_id(0), view_index = get_group_id(1), big_count = min(frame_counts[COUNT_BIG], big_capacity);
     if (item == 0) queued = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     uint groups = get_num_groups(0) - splat_groups, i = get_global_id(0) - groups * BIN_ITEMS;
@@ -255,7 +255,7 @@ kernel __attribute__((reqd_work_group_size(BIN_ITEMS, 1, 1))) void emit(
         for (uint n = 0; n < UNROLL; n++)
             if (positions[n] < tile_range.capacity) pairs[positions[n]] = (uint2)(first_splat + owners[n], depths[owners[n]]);
     }
-    if (item == 0 && counts_visible && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
+    if (item == 0 && counts_visible && visible != 0) atomic_add(frame_counts + COUNT_VISIBLE, visible);
 }
 
 // Sorts each tile's list by (depth key, splat); all keys differ.

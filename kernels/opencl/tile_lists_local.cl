@@ -87,7 +87,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void count_local(
 }
 
 // Index space: as count_local.
-// Reads: windows, keys, starts. Reads and overwrites: cursors of the range. Writes: pairs; adds to counts[COUNT_VISIBLE].
+// Reads: windows, keys, starts. Reads and overwrites: cursors of the range. Writes: pairs; adds to frame_counts[COUNT_VISIBLE].
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
 //@@ arguments emit_local
 ) {
@@ -124,5 +124,5 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_local(
     }
     if (visible_here != 0) atomic_add(&visible, visible_here);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (get_local_id(0) == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
+    if (get_local_id(0) == 0 && visible != 0) atomic_add(frame_counts + COUNT_VISIBLE, visible);
 }

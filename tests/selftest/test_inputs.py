@@ -40,7 +40,7 @@ def test_list_offsets_wrap_at_2_to_the_32(renderer, monkeypatch, budget):
     backend = opencl(renderer)
     cloud = random_splats(60, seed=46, depth=(1.0, 4.0), scale=(0.05, 0.4))
     expected = renderer.render(cloud, inputs.VIEW, ("rgb", "depth"))
-    stage = {"sort_first": "count_pairs", "bin_first": "start_lists"}[backend.config.binning]
+    stage = {"sort_first": "count_pairs", "bin_first": "compute_list_starts"}[backend.config.binning]
     original = getattr(tiling, stage)
 
     def moved(frame, *args):

@@ -142,7 +142,7 @@ def test_what_makes_no_lens(make, words):
 def test_the_map_knows_every_sample(lens):
     """In any rectangle of the lookup table, the cells' boxes hold all samples whose rays are in it."""
     raster = RayRaster(lens, 90, 70, 60.0, 60.0, 45.0, 35.0)
-    boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.bounds_pyramid
+    boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.inverse_lens_lut
     x, y = raster.lut_coordinates(raster.rays)
     generator, first = np.random.default_rng(3), 0
     size = int(cells)
@@ -312,4 +312,4 @@ SIDES = {(90, 70): 32, (20, 64): 32, (63, 9): 16, (1500, 4): 512}
 def test_maps_have_a_cell_for_two_pixels_of_the_longer_side(size):
     """The largest power of two, `CELLS` at most: with fewer cells bounds are loose and binning is slow."""
     raster = RayRaster(Fisheye(), *size, 60.0, 60.0, size[0] / 2, size[1] / 2)
-    assert raster.bounds_pyramid[1][4] == SIDES[size]
+    assert raster.inverse_lens_lut[1][4] == SIDES[size]

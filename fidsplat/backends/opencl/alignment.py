@@ -408,7 +408,7 @@ class _Replayed:
         rotation, commands = frame.source.uniform_groups.get("rotation", {}), frame.commands
         self._rotation = [(at, index) for index, name in rotation.items() for at in commands.positions(name)]
         """arguments that depend on the rotation, with indices of its elements"""
-        self._counts = frame.acquired["counts"]
+        self._counts = frame.acquired["frame_counts"]
         own = {f"{name}_out": frame.acquired[f"{name}_out"] for name in ("rgb", "depth")}
         self.images = _ReplayedImages(own, owner), _ReplayedImages(perturbed)
         self._generation, self._number = pool.generation, -1
@@ -444,7 +444,7 @@ class _Replayed:
                 return False
             # `align_step` overwrites this buffer: after `scratch`, the next `upload` copies the view again
             self.view = workspace.pool.scratch("view", self.record.nbytes)
-            self._recorded.commands.set({"counts": self._counts})
+            self._recorded.commands.set({"frame_counts": self._counts})
         return True
 
     def arguments(self, groups: int, totals: cl.Buffer) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class BufferPool:
         self._contents: dict[str, weakref.ref[np.ndarray | DeviceRecord]] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
         self._zeroed: set[str] = set()
-        self._key: Hashable = None
+        self._size_key: Hashable = None
         self._splats = 0
         self.generation = object()
         """a new object whenever a scratch buffer is replaced or released"""
@@ -97,14 +97,14 @@ class BufferPool:
                 size += buffer.size
         return size
 
-    def trim(self, key: Hashable, size: int, splats: int = 0) -> None:
-        """Release all buffers if they exceed `size` bytes, and the last frames had another key or fewer
-        splats than the next frame."""
-        if key == self._key and splats <= self._splats:
+    def trim(self, size_key: Hashable, size: int, splats: int = 0) -> None:
+        """Release all buffers if they exceed `size` bytes, and the last frames had buffers of other sizes or
+        fewer splats than the next frame. size_key: equal for frames with buffers of equal sizes."""
+        if size_key == self._size_key and splats <= self._splats:
             return
         if self.memory_bytes > size:
             self.clear()
-        self._key, self._splats = key, splats
+        self._size_key, self._splats = size_key, splats
 
     def invalidate_zeros(self) -> None:
         """Mark the contents of zero-filled buffers as unknown, after a failure."""
@@ -221,11 +221,10 @@ class RayBuffers:
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planar("rays", raster.rays, rows, columns)}
             if raster.lens.kind != "equirectangular":
-                maps = self._buffers.setdefault(raster.full_raster or raster, {}).setdefault((0, 0), {})
-                # one table: `bounds_pyramid` on the host, `inverse_lens_lut` in kernels
-                if "inverse_lens_lut" not in maps:
-                    maps["inverse_lens_lut"] = self._upload("inverse_lens_lut", raster.bounds_pyramid[0])
-                sizes[rows, columns]["inverse_lens_lut"] = maps["inverse_lens_lut"]
+                tables = self._buffers.setdefault(raster.full_raster or raster, {}).setdefault((0, 0), {})
+                if "inverse_lens_lut" not in tables:
+                    tables["inverse_lens_lut"] = self._upload("inverse_lens_lut", raster.inverse_lens_lut[0])
+                sizes[rows, columns]["inverse_lens_lut"] = tables["inverse_lens_lut"]
         buffers = sizes[rows, columns]
         if with_derivatives and "ray_derivatives" not in buffers:
             flat = raster.ray_derivatives.reshape(raster.height, raster.width, 6)
@@ -250,7 +249,7 @@ class RayBuffers:
         first = next(iter(rasters))
         ray_bytes = 36 if with_derivatives else 12
         return ray_bytes * rows * columns + (
-            first.bounds_pyramid[0].nbytes if first.lens.kind != "equirectangular" else 0
+            first.inverse_lens_lut[0].nbytes if first.lens.kind != "equirectangular" else 0
         )
 
     def _upload(self, name: str, array: np.ndarray) -> cl.Buffer:

@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 COUNTS = 4
-"""words of the buffer `counts`, as in tile_lists.cl: big splats, pairs (two words), visible splats"""
+"""words of the buffer `frame_counts`, as in tile_lists.cl: big splats, pairs (two words), visible splats"""
 COUNTERS = 8
 """counters of the buffer `counters`, as in prelude.cl"""
 VISIBLE, PAIRS, BIG = 0, 2, 6
@@ -25,7 +25,7 @@ class Counts:
 
     @staticmethod
     def read(queue: cl.CommandQueue, counts: cl.Buffer, after: Sequence[cl.Event] | None = None) -> Counts:
-        """Read the buffer `counts` once the events have completed."""
+        """Read the buffer `frame_counts` once the events have completed."""
         words = np.empty(COUNTS, np.uint32)
         cl.enqueue_copy(queue, words, counts, wait_for=after)
         return Counts(int(words[0]), int(words[1]) | int(words[2]) << 32, int(words[3]))

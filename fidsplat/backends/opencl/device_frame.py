@@ -57,7 +57,7 @@ class FrameBuffers:
     """unsorted lists: depth key and splat (capacity) uint2"""
     lists: cl.Buffer
     """splats of each tile in depth order (capacity) uint32"""
-    counts: cl.Buffer
+    frame_counts: cl.Buffer
     """totals that the host reads (`Counts`)"""
     raw: cl.Buffer
     """samples (4, s) float32: r, g, b, transmittance"""
@@ -110,7 +110,7 @@ class DeviceFrame:
         frame; 0: no limit."""
         self.workspace, self.commands, self.config = workspace, commands, config
         self.resident, self.plan = resident, plan
-        self.projected = resident.count
+        self.records_per_view = resident.count
         """records per view: the number of splats, or with `culls_first` the capacity for unculled splats"""
         self.batch, self.views = views, len(views)
         self.view = view = views.view
@@ -184,7 +184,7 @@ class DeviceFrame:
     def read_counts(self, counted: cl.Event) -> Counts:
         """Read the counts after the launch `counted`, while later stages run."""
         self.queue.flush()
-        return Counts.read(self.workspace.side_queue, self.buffers.counts, [counted])
+        return Counts.read(self.workspace.side_queue, self.buffers.frame_counts, [counted])
 
     def launch(
         self,
@@ -201,7 +201,7 @@ class DeviceFrame:
         if views > 1:
             size, group = (*size, views), (*group, 1)
         values = [
-            arguments[name] if name in arguments else self.value(declared)
+            arguments[name] if name in arguments else self.argument_value(declared)
             for name, declared in self.source.arguments[kernel].items()
         ]
         event = self.commands.launch(self.queue, kernel, size, group, values, stage)
@@ -214,7 +214,7 @@ class DeviceFrame:
         self.commands.clear()
         self.events, self.stages = [], []
 
-    def value(self, argument: Argument) -> Any:
+    def argument_value(self, argument: Argument) -> Any:
         name = argument.name
         for values in (self.named, self.scalars):
             if name in values:

@@ -1,7 +1,7 @@
-"""The stages of a frame in order: project, bin, sort, blend, resolve.
+"""The stages of a frame in order: project, bin and sort, blend, resolve; a CPU sorts before it bins.
 
 They are submitted to one in-order queue. A frame with more pairs than the memory budget allows is binned and
-blended in ranges of tiles; a frame with a shutter is blended pose by pose and resolved once. Images are
+blended in ranges of tiles. A frame with a shutter is blended pose by pose and resolved once. Images are
 bit-identical in every case.
 """
 
@@ -66,7 +66,7 @@ def render_sort_first(frame: DeviceFrame) -> None:
         big = counts.big
         frame.discard_launches()
     for tile_range in tiling.tile_ranges(frame, frame.first_tile, frame.end_tile, counts.pairs):
-        tiling.list_sorted(frame, tile_range, count)
+        tiling.fill_sorted_lists(frame, tile_range, count)
         blend(frame, tile_range)
     resolve(frame)
     frame.pairs, frame.stats = counts.pairs, partial(counts.stats, count)
@@ -76,16 +76,16 @@ def render_bin_first(frame: DeviceFrame) -> None:
     """Render on a GPU: submit all stages with the list capacity of previous frames, and again with larger
     lists if the pairs exceed it."""
     frame.upload_view(0, frame.rows)
-    frame.acquire("counts", 4 * COUNTS)
+    frame.acquire("frame_counts", 4 * COUNTS)
     capacity = tiling.pair_capacity(frame.workspace, frame.config)
     if frame.pair_limit:
         capacity = min(capacity, frame.pair_limit)
     tiling.project_and_count(frame)
-    counted = tiling.start_lists(frame, capacity)
+    counted = tiling.compute_list_starts(frame, capacity)
     frame.launches_until_counts = len(frame.events)
     if capacity:
         all_tiles = TileRange(0, frame.tiles, capacity)
-        tiling.list_and_sort(frame, all_tiles, capacity, counts_visible=True)
+        tiling.fill_and_sort_lists(frame, all_tiles, capacity, counts_visible=True)
         blend(frame, all_tiles)
         resolve(frame)
     if frame.waits:
@@ -94,7 +94,7 @@ def render_bin_first(frame: DeviceFrame) -> None:
         frame.counted, frame.pairs = counted, capacity
     frame.queue.flush()
     reader, last, count = frame.workspace.read_queue, frame.events[-1], frame.resident.count
-    frame.stats = partial(read_stats, reader, frame.buffers.counts, last, count)
+    frame.stats = partial(read_stats, reader, frame.buffers.frame_counts, last, count)
 
 
 def complete_bin_first(frame: DeviceFrame, counted: cl.Event, capacity: int) -> None:
@@ -102,17 +102,17 @@ def complete_bin_first(frame: DeviceFrame, counted: cl.Event, capacity: int) -> 
     counts = frame.read_counts(counted)
     while counts.big > frame.scalars["big_capacity"]:
         tiling.project_and_count(frame, counts.big)
-        counted, capacity = tiling.start_lists(frame, 0), 0
+        counted, capacity = tiling.compute_list_starts(frame, 0), 0
         counts = frame.read_counts(counted)
     frame.pairs = counts.pairs
     if capacity and counts.pairs <= capacity:
         return
-    tiling.start_lists(frame, _UNLIMITED)
+    tiling.compute_list_starts(frame, _UNLIMITED)
     tile_ranges = tiling.tile_ranges(frame, 0, frame.tiles, counts.pairs)
     with_margin = min(counts.pairs * 5 // 4, frame.workspace.pair_budget)
     capacity = max(with_margin, *(tile_range.pairs for tile_range in tile_ranges))
     for tile_range in tile_ranges:
-        tiling.list_and_sort(frame, tile_range, capacity, counts_visible=tile_range is tile_ranges[0])
+        tiling.fill_and_sort_lists(frame, tile_range, capacity, counts_visible=tile_range is tile_ranges[0])
         blend(frame, tile_range)
     resolve(frame)
 
@@ -133,7 +133,7 @@ def render_in_slices(frame: DeviceFrame) -> None:
         first, last = top * frame.tiles_x, end * frame.tiles_x
         listed = int(tiling.tile_pairs(frame)[first:last].sum(dtype=np.int64))
         for tile_range in tiling.tile_ranges(frame, first, last, listed):
-            tiling.list_sorted(frame, tile_range, packed.count)
+            tiling.fill_sorted_lists(frame, tile_range, packed.count)
             blend(frame, tile_range)
         visible, pairs = max(visible, packed.visible), pairs + listed
     resolve(frame)
@@ -146,7 +146,7 @@ def blend(frame: DeviceFrame, tile_range: TileRange) -> None:
     arguments: dict[str, Any] = {"first_tile": tile_range.first}
     if frame.config.schedule == "group":
         ordered = frame.config.binning != "sort_first" and tile_range.end - tile_range.first == frame.tiles
-        # without an order the kernel does not read it, but an argument must be a buffer
+        # every pointer argument needs a buffer; the kernel reads `tile_order` only if `longest_first`
         arguments["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
         arguments["longest_first"] = ordered
     frame.launch("blend", "blend", ((tile_range.end - tile_range.first) * group,), (group,), **arguments)
@@ -181,34 +181,40 @@ def render_sub_frames(frame: DeviceFrame) -> None:
     }
     stats = {"splats": frame.resident.count, "visible": 0, "pairs": 0}
     for sub_frame in frame.view.sub_frames:
-        part = frame.sub_frame(sub_frame.view)
-        part.named |= background_arrays
-        render(part)
-        frame.events += part.events
-        frame.stages += part.stages
-        accumulate(frame, part, sub_frame)
-        for name, value in part.stats().items():
+        blended = frame.sub_frame(sub_frame.view)
+        blended.named |= background_arrays
+        render(blended)
+        frame.events += blended.events
+        frame.stages += blended.stages
+        accumulate(frame, blended, sub_frame)
+        for name, value in blended.stats().items():
             stats[name] = max(stats[name], value)
-        frame.uploads += part.uploads
-        frame.pool.release(part.acquired.items())
+        frame.uploads += blended.uploads
+        frame.pool.release(blended.acquired.items())
     if "rays" in frame.source.arguments.get("resolve", {}):
         frame.bind_rays()
     resolve(frame)
     frame.stats = partial(dict, stats)
 
 
-def accumulate(frame: DeviceFrame, part: DeviceFrame, sub_frame: SubFrame) -> None:
-    """Add the samples of a sub-frame to those of the frame."""
+def accumulate(frame: DeviceFrame, blended: DeviceFrame, sub_frame: SubFrame) -> None:
+    """Add the samples of a blended sub-frame to those of the frame."""
     size = sub_frame.view.width, sub_frame.view.height
-    strides = {
-        **{"frame_stride": frame.stride, "frame_channel_stride": frame.rows * frame.stride},
-        **{"stride": part.stride, "channel_stride": part.rows * part.stride, "top": sub_frame.top},
-    }
     for samples in frame.sample_buffers:
         if not (samples.averaged or sub_frame.middle):
             continue
-        buffers = {"raw": part.named[samples.name], "accumulated": frame.named[samples.name]}
-        weights = {"weight": sub_frame.weight, "first": sub_frame.first} if samples.averaged else {}
-        kernel = "accumulate" if samples.averaged else "copy_middle"
-        arguments = {**strides, **buffers, **weights, "channels": samples.channels}
-        _launch_grid(frame, "accumulate", kernel, *size, **arguments)
+        arguments: dict[str, Any] = {
+            "stride": blended.stride,
+            "channel_stride": blended.rows * blended.stride,
+            "frame_stride": frame.stride,
+            "frame_channel_stride": frame.rows * frame.stride,
+            "top": sub_frame.top,
+            "channels": samples.channels,
+            "raw": blended.named[samples.name],
+            "accumulated": frame.named[samples.name],
+        }
+        if samples.averaged:
+            weights = {"weight": sub_frame.weight, "first": sub_frame.first}
+            _launch_grid(frame, "accumulate", "accumulate", *size, **arguments, **weights)
+        else:
+            _launch_grid(frame, "accumulate", "copy_middle", *size, **arguments)

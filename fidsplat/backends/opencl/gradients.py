@@ -253,7 +253,7 @@ class TileGradients:
             sizes = {"project_step": (max(1, -(-count // _GROUP)) * _GROUP, _GROUP)}
             sizes |= {"refine_view": (_REFINE_ITEMS, _REFINE_ITEMS)} if refined else {}
             values = {
-                name: arguments[name] if name in arguments else frame.value(argument)
+                name: arguments[name] if name in arguments else frame.argument_value(argument)
                 for kernel in sizes
                 for name, argument in declared[kernel].items()
             }

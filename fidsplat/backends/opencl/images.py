@@ -114,13 +114,15 @@ class OpenCLImages(Images):
         return self._size if channels == 1 else (*self._size, channels)
 
     def buffer(self, name: str) -> cl.Buffer:
-        return self.complete()[0].acquired[f"{name}_out"] if self._batch is None else self._batch[name][1]
+        return (
+            self.ensure_complete()[0].acquired[f"{name}_out"] if self._batch is None else self._batch[name][1]
+        )
 
     def _completion_events(self) -> list[cl.Event]:
         """Events after which the images are complete."""
         if not self._rendered:  # all views are masked out
             self._workspace.queue.finish()
-        for part in self.complete():
+        for part in self.ensure_complete():
             part.queue.flush()
         return [part.events[-1] for part in self._rendered]
 
@@ -154,14 +156,14 @@ class OpenCLImages(Images):
 
     def wait(self) -> None:
         with self._workspace.device_errors("rendering"):
-            for part in self.complete():
+            for part in self.ensure_complete():
                 part.queue.finish()
 
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds by stage. For a replayed frame the first call renders it once more, with profiling."""
         with self._workspace.device_errors("rendering"):
-            rendered = self.complete()
+            rendered = self.ensure_complete()
             if self._replay is not None and rendered[0].stages is None:
                 with self._workspace.lock:
                     self._timings = self._timings or self._replay.timings()
@@ -172,11 +174,11 @@ class OpenCLImages(Images):
     def stats(self) -> Mapping[str, int]:
         """Number of splats of the cloud, and of visible splats and pairs of all views."""
         with self._workspace.device_errors("rendering"):
-            stats = summed(part.stats() for part in self.complete())
+            stats = summed(part.stats() for part in self.ensure_complete())
             stats = {"splats": 0, "visible": 0, "pairs": 0} | stats | {"splats": self._splats}
             return summed([stats, *(copied.stats() for copied in self._copied)])
 
-    def complete(self) -> list[Rendered]:
+    def ensure_complete(self) -> list[Rendered]:
         """The rendered parts; a replayed frame that exceeded its capacity is rendered again."""
         if self._replay is not None:
             with self._workspace.lock:
@@ -191,7 +193,7 @@ class OpenCLImages(Images):
         with self._workspace.device_errors("rendering"):
             (height, width), view = self._tile, self._view
             keys = np.empty((-(-view.height // height), -(-view.width // width)), np.uint32)
-            (rendered,) = self.complete()
+            (rendered,) = self.ensure_complete()
             queue, buffer = self._workspace.read_queue, rendered.acquired["termination_depths"]
             cl.enqueue_copy(queue, keys, buffer, wait_for=self._completion_events())
         return TerminationDepths.of_keys(keys, self._tile)
@@ -214,7 +216,7 @@ class OpenCLImages(Images):
                     )
             if copied is not None:
                 copied.wait()  # the next frame may overwrite the buffers of `other`
-            (rendered,) = other.complete()
+            (rendered,) = other.ensure_complete()
             self._copied.append(replace(rendered, acquired={}, stats=partial(dict, rendered.stats())))
 
     def _rectangles(self, tiles: np.ndarray) -> Iterator[tuple[int, int, int, int]]:

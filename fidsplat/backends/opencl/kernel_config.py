@@ -10,7 +10,7 @@ from fidsplat.effects import FeatureSet
 
 @dataclass(frozen=True)
 class KernelConfig:
-    """Build constants that follow from the kind of device, not from the scene."""
+    """Build constants of the kernels: of the device, then adapted to features, frame size and cloud."""
 
     schedule: str
     """`lanes` (CPU: a work-item renders a tile) or `group` (GPU: a work-group renders a tile)"""

@@ -177,27 +177,27 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "bin_count": _BIN_ARGUMENTS,
     "bin_emit": args(*(_BIN_ARGUMENTS, "in uint starts", "int first_tile end_tile", "out uint lists")),
     "tile_starts": args(
-        "uint tiles capacity", "in uint counters", "out uint starts cursors counts tile_order"
+        "uint tiles capacity", "in uint counters", "out uint starts cursors frame_counts tile_order"
     ),
     "count_big": args("uint count", _SIZE, _BIG, "in uint big", "out uint counters"),
     "emit": args(
         *(
             "uint count",
             "uint splat_groups  // work-groups with one work-item per splat, after those of the big splats",
-            "uint counts_visible  // whether to add the visible splats to counts",
+            "uint counts_visible  // whether to add the visible splats to frame_counts",
             _SIZE,
             "int first_tile end_tile",
             "uint capacity big_capacity",
         ),
         *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
-        *("out uint counts cursors", "out uint2 pairs"),
+        *("out uint frame_counts cursors", "out uint2 pairs"),
     ),
     "count_local": args("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint counters"),
     "emit_local": args(
         "uint count",
-        "uint counts_visible  // whether to add the visible splats to counts",
+        "uint counts_visible  // whether to add the visible splats to frame_counts",
         *(_SIZE, "int first_tile end_tile", "uint capacity"),
-        *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
+        *("in uint2 windows", "in uint keys starts", "out uint frame_counts cursors", "out uint2 pairs"),
     ),
     "sort_tiles": args(
         "int first_tile",

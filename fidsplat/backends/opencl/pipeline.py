@@ -190,7 +190,7 @@ class OpenCLPipeline(Pipeline):
         replay = Replay(recorded, resident, view, self.render_again)
         images = OpenCLImages(self, view, [rendered], resident.count, replay=replay)
         if not resident.immutable:
-            images.complete()
+            images.ensure_complete()
         return images
 
     def _record(

@@ -145,7 +145,7 @@ class OpenCLProbe(Probe):
         arguments = {"starts": starts}
         if pipeline.config.binning != "sort_first":
             kernel, total_index, size = "tile_starts", 1, (3 * items[0],)
-            arguments |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
+            arguments |= {"tiles": len(lengths), "capacity": 2**32 - 1, "frame_counts": sums}
             counters = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
             arguments |= {"counters": counters, "cursors": buffer_of(workspace, lengths)}
             arguments["tile_order"] = buffer_of(workspace, np.empty_like(lengths))

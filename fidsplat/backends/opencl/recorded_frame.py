@@ -78,7 +78,9 @@ class RecordedFrame:
         if not self._waits:
             events = commands.submit(queue)
             queue.flush()
-            stats = partial(read_stats, self.workspace.read_queue, acquired["counts"], events[-1], splats)
+            stats = partial(
+                read_stats, self.workspace.read_queue, acquired["frame_counts"], events[-1], splats
+            )
             stages = None if queue is self.workspace.replay_queue else self._stages
             return Rendered(queue, acquired, stats, events, stages)
         counters = pool.scratch("counters", self._counter_bytes)
@@ -142,7 +144,7 @@ class Replay:
         if workspace.frames != self._frame_number:  # later frames were submitted: do not wait for them
             queue.flush()
             queue, after = workspace.read_queue, rendered.events[-1:]
-        counts = Counts.read(queue, rendered.acquired["counts"], after)
+        counts = Counts.read(queue, rendered.acquired["frame_counts"], after)
         complete = None if self._capacity.holds(counts) else self._render_again(resident, self._view)
         self._resident = None  # release the cloud, which is no longer needed
         return complete

@@ -1,11 +1,12 @@
-"""Tile binning: the splats of each tile, in depth order.
+"""Tile binning: the splats of each tile, in depth order, by one of three strategies.
 
-`sort_first` (CPUs, and all devices for projection in slices): all visible splats are sorted by depth, then
-appended to tile lists in that order, by counting sorts over a few contiguous blocks: long sequential loops,
-no atomics. `bin_first` (GPU): the projection counts the splats of each tile, (splat, tile) pairs are written
-in any order, and each tile's list is sorted in local memory. `bin_local`: like `bin_first`, with counters in
-local memory, for many small views and for stores, where atomics of neighbouring splats on one tile's counter
-would serialise.
+- `sort_first`: radix-sort the visible splats by depth, then append them to the tile lists in this order, by a
+  counting sort. CPUs use it, since it has long sequential loops and no atomics. All devices use it to project
+  in slices.
+- `bin_first`, on GPUs: count the splats of each tile during the projection, write the (splat, tile) pairs in
+  any order, and sort each tile's list in local memory.
+- `bin_local`: like `bin_first`, but count in local memory. It is for many small views, and for stores, where
+  neighbouring splats would increment one tile's counter at the same time.
 """
 
 from __future__ import annotations
@@ -36,9 +37,6 @@ _START_TILES, _MAX_START_GROUPS = 512, 32
 lengths"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 """window of a splat without tiles: an index beyond the end of `big`, and no bits"""
-_LISTS = ("lists", "windows")
-"""name of the lists' scratch buffer, by `culls_first`: True reuses the buffer of the windows, which no kernel
-reads after `emit`"""
 
 
 class TileRange(NamedTuple):
@@ -63,19 +61,20 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
 
 
 def cull(frame: DeviceFrame, big: int) -> None:
-    """List the groups of splats that are not culled by their bounding spheres, and set `frame.projected`."""
+    """List the groups of splats that are not culled by their bounding spheres, and set
+    `frame.records_per_view`."""
     pool, culling_groups = frame.pool, -(-frame.resident.count // CULLING_GROUP)
     frame.scratch("unculled", 4 * MIN_BIG // CULLING_GROUP)
     for name in ("spheres", "max_scales", "splat_ids"):
         frame.named[name] = frame.resident.sorted_array(name)
     while True:
         capacity = min(pool.size("unculled") // 4, culling_groups)
-        frame.projected = CULLING_GROUP * capacity
+        frame.records_per_view = CULLING_GROUP * capacity
         arguments = {"groups": culling_groups, "capacity": capacity}
         frame.launch("project", "cull_groups", (culling_groups,), (_ITEMS,), **arguments)
         if not frame.waits:
             break
-        # with `culls_first` this counter is the number of groups that are not culled
+        # `cull_groups` counts the groups that are not culled in this counter
         unculled = int(frame.read("counters", np.uint32, (COUNTERS,))[VISIBLE])
         if unculled <= capacity:
             break
@@ -88,7 +87,7 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
     windows."""
     count, size = end - first, _splat_capacity(frame, end - first)
     if frame.config.culls_first:
-        size = frame.projected
+        size = frame.records_per_view
     frame.scratch("splats", size * frame.source.records["Splat"].itemsize)
     frame.scratch("keys", KEY_BYTES * size)
     windows = frame.scratch("windows", WINDOW_BYTES * size)
@@ -161,7 +160,8 @@ def tile_pairs(frame: DeviceFrame) -> np.ndarray:
     return frame.read("counters", np.uint32, (COUNTERS + frame.tiles,))[COUNTERS:]
 
 
-def list_sorted(frame: DeviceFrame, tile_range: TileRange, count: int) -> None:
+def fill_sorted_lists(frame: DeviceFrame, tile_range: TileRange, count: int) -> None:
+    """Append the sorted splats to the lists of a range of tiles."""
     allocated, budget = frame.pool.size("lists") // 4, frame.workspace.pair_budget
     size = enlarged(tile_range.pairs, budget) if 0 < allocated < tile_range.pairs else tile_range.pairs
     frame.scratch("lists", 4 * size)
@@ -260,8 +260,9 @@ def split_rows(frame: DeviceFrame, top: int, end: int, count: int) -> list[tuple
 
 
 def pair_capacity(workspace: Workspace, config: KernelConfig) -> int:
+    """Number of pairs that the allocated lists can hold."""
     pool = workspace.pool
-    lists = pool.size(_LISTS[config.culls_first])
+    lists = pool.size("windows" if config.culls_first else "lists")
     return min(lists // 4, pool.size("pairs") // 8, workspace.pair_budget)
 
 
@@ -271,13 +272,13 @@ def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
     if frame.config.culls_first:
         cull(frame, big)
     project(frame, 0, frame.resident.count)
-    count = frame.projected
+    count = frame.records_per_view
     frame.launch("bin", "count_big", (_big_groups(frame) * _ITEMS,), (_ITEMS,), count=count)
     if frame.config.binning == "bin_local":
         launch_local(frame, "count_local")
 
 
-def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
+def compute_list_starts(frame: DeviceFrame, capacity: int) -> cl.Event:
     """Compute the start of each tile's list; all lists are empty if there are more pairs than `capacity`."""
     items = frame.config.scan_items
     frame.scratch("starts", 4 * (frame.tiles + 1))
@@ -288,11 +289,16 @@ def start_lists(frame: DeviceFrame, capacity: int) -> cl.Event:
     return frame.launch("bin", "tile_starts", (work_groups * items,), (items,), **arguments)
 
 
-def list_and_sort(frame: DeviceFrame, tile_range: TileRange, capacity: int, counts_visible: bool) -> None:
+def fill_and_sort_lists(
+    frame: DeviceFrame, tile_range: TileRange, capacity: int, counts_visible: bool
+) -> None:
+    """Write the pairs of a range of tiles, and sort each list. counts_visible: whether to add up the number
+    of visible splats, which the first range does."""
     frame.scratch("pairs", 8 * capacity)
-    shared = frame.config.culls_first and not frame.in_tile_ranges
-    frame.buffers.lists = frame.pool.scratch(_LISTS[shared], 4 * capacity)
-    count, views, work_groups = frame.projected, frame.views, _big_groups(frame)
+    # with `culls_first` the lists reuse the buffer of the windows, which no kernel reads after `emit`
+    reuses = frame.config.culls_first and not frame.in_tile_ranges
+    frame.buffers.lists = frame.pool.scratch("windows" if reuses else "lists", 4 * capacity)
+    count, views, work_groups = frame.records_per_view, frame.views, _big_groups(frame)
     arguments = {
         "first_tile": tile_range.first,
         "end_tile": tile_range.end,

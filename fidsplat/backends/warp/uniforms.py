@@ -167,7 +167,7 @@ def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
         cached["rays"] = _fresh("rays", raster.rays.reshape(-1, 3), wp.vec3, workspace)
         if raster.lens.kind != "equirectangular":
             cached["cells"] = _fresh(
-                "inverse lens lookup table", raster.bounds_pyramid[0], wp.vec4s, workspace
+                "inverse lens lookup table", raster.inverse_lens_lut[0], wp.vec4s, workspace
             )
     return cached
 
