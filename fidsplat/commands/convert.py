@@ -28,15 +28,15 @@ class MeshOptions:
     views around the scene)"""
     faces: int | None = None
     """N: maximum number of triangles (extra: mesh)"""
-    parts: int = 32
-    """N: maximum number of convex parts in .xml (extra: mesh)"""
+    parts: int | None = None
+    """N: maximum number of convex parts in .xml; more fill less space in front of surfaces (default: 512)"""
 
     def __post_init__(self) -> None:
-        if not self.mesh and (self.voxel, self.cameras, self.faces, self.parts) != (None, None, None, 32):
+        if not self.mesh and (self.voxel, self.cameras, self.faces, self.parts) != (None,) * 4:
             raise InputError(
                 "--voxel, --cameras, --faces and --parts must be given with --mesh, got none; add it"
             )
-        if self.parts < 1:
+        if self.parts is not None and self.parts < 1:
             raise InputError(f"--parts must be at least 1, got {self.parts}")
 
 
@@ -112,7 +112,10 @@ class Convert:
         return report(self.json, facts, *lines)
 
     def _mesh(self) -> int:
+        import numpy as np
+
         import fidsplat as fs
+        from fidsplat.formats.convex_parts import MAX_PARTS
         from fidsplat.formats.meshes import check_mesh_file, save_mesh
         from fidsplat.scenes.sources import cameras_of, load_source
 
@@ -124,12 +127,18 @@ class Convert:
             mesh = fs.scene_mesh(scene, views, self.mesh.voxel, renderer, progress)
         if self.mesh.faces is not None:
             mesh = mesh.simplified(self.mesh.faces)
-        files = save_mesh(mesh, target, self.mesh.parts)
+        parts = save_mesh(mesh, target, self.mesh.parts or MAX_PARTS)
         facts: dict[str, Any] = {"source": self.source, "target": self.target, "format": "mesh"}
         facts |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "area_m2": mesh.area}
-        facts["files"] = [str(file) for file in files]
-        more = f" and {len(files) - 1} convex parts" if len(files) > 1 else ""
-        return report(self.json, facts, f"{len(mesh.faces):,} triangles: {self.target}{more}")
+        line = f"{len(mesh.faces):,} triangles: {self.target}"
+        if parts:
+            gaps = np.quantile(np.concatenate([part.gaps for part in parts]), (0.5, 0.95, 1))
+            facts |= {"parts": len(parts), "filled_m": dict(zip(("median", "p95", "max"), gaps, strict=True))}
+            line += (
+                f", {len(parts)} convex parts, which fill {gaps[0]:.2g} m in front of the surface (median; "
+                f"95 %: {gaps[1]:.2g} m, maximum {gaps[2]:.2g} m)"
+            )
+        return report(self.json, facts, line)
 
     def _page(self) -> int:
         from fidsplat.scenes.sources import load_source

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fidsplat.formats.convex_parts import MAX_PARTS, ConvexPart, convex_parts
 from fidsplat.formats.gltf import gltf_document, pack_glb
 from fidsplat.formats.ply_header import header_bytes
 from fidsplat.util.errors import InputError, required_package
@@ -80,26 +80,11 @@ class TriangleMesh:
             colors = sums / np.maximum(counts, 1)
         return TriangleMesh(points + center, triangles.astype(np.int32), colors)
 
-    def convex_parts(self, max_parts: int) -> list[TriangleMesh]:
-        """Approximate convex decomposition (CoACD) into at most this many parts.
 
-        Raises:
-            InputError: the package coacd is missing.
-        """
-        coacd = _package("coacd")
-        coacd.set_log_level("error")
-        center = self.vertices.mean(0)
-        mesh = coacd.Mesh(self.vertices - center, self.faces)
-        preprocess = "off" if self.closed else "auto"  # remeshing would take most of the time
-        parts = coacd.run_coacd(mesh, max_convex_hull=max_parts, preprocess_mode=preprocess, seed=0)
-        return [TriangleMesh(np.asarray(v) + center, np.asarray(f, np.int32)) for v, f in parts]
+def save_mesh(mesh: TriangleMesh, path: Path, parts: int = MAX_PARTS) -> list[ConvexPart]:
+    """Write a mesh in the format of the file's suffix; returns the convex parts of .xml.
 
-
-def save_mesh(mesh: TriangleMesh, path: Path, parts: int = 32) -> list[Path]:
-    """Write a mesh in the format of the file's suffix; returns the written files.
-
-    .glb has colours and y up, .ply has colours; .xml is a MuJoCo model of convex parts, in OBJ files next to
-    it.
+    .glb has colours and y up, .ply has colours; .xml is a MuJoCo model of at most `parts` convex parts.
 
     Raises InputError for another suffix, an empty mesh, or a file that cannot be written.
     """
@@ -109,35 +94,31 @@ def save_mesh(mesh: TriangleMesh, path: Path, parts: int = 32) -> list[Path]:
             "a mesh must have at least one triangle, got none; set other cameras or another voxel size"
         )
     if suffix == ".xml":
-        return _save_mujoco(mesh.convex_parts(parts), path)
+        hulls = convex_parts(mesh.vertices, mesh.faces, parts)
+        write_file(path, _mujoco(hulls, path.stem))
+        return hulls
     writer = {".glb": _glb, ".ply": _ply, ".obj": _obj, ".stl": _stl}[suffix]
     write_file(path, writer(mesh))
-    return [path]
+    return []
 
 
 def check_mesh_file(path: Path) -> Path:
-    """Validate the path of a mesh before it is computed. Raises InputError for an unknown suffix or a missing
-    package."""
-    suffix = path.suffix.lower()
-    if suffix not in MESH_FORMATS:
+    """Validate the path of a mesh before it is computed. Raises InputError for an unknown suffix."""
+    if path.suffix.lower() not in MESH_FORMATS:
         raise InputError(f"the suffix of a mesh must be {', '.join(MESH_FORMATS)}, got {path}")
-    # not imported yet: PoCL's compiler, which fusing needs, fails if coacd was loaded before it
-    if suffix == ".xml" and find_spec("coacd") is None:
-        _package("coacd")
     return path
 
 
-def _save_mujoco(parts: list[TriangleMesh], path: Path) -> list[Path]:
-    files = [path.with_name(f"{path.stem}-{k}.obj") for k in range(len(parts))]
-    for part, file in zip(parts, files, strict=True):
-        write_file(file, _obj(part))
-    names = [file.stem for file in files]
-    assets = [f'    <mesh name="{n}" file="{n}.obj" inertia="convex"/>' for n in names]
-    geoms = [f'      <geom type="mesh" mesh="{name}"/>' for name in names]
-    lines = [f'<mujoco model="{path.stem}">', "  <asset>", *assets, "  </asset>", "  <worldbody>"]
-    lines += [f'    <body name="{path.stem}">', *geoms, "    </body>", "  </worldbody>", "</mujoco>", ""]
-    write_file(path, "\n".join(lines))
-    return [path, *files]
+def _mujoco(parts: list[ConvexPart], name: str) -> str:
+    """MuJoCo model of one static body; MuJoCo computes the hulls of the vertices."""
+    assets, geoms = [], []
+    for number, part in enumerate(parts):
+        values = " ".join(f"{value:.6g}" for value in part.vertices.ravel())
+        assets.append(f'    <mesh name="{name}-{number}" inertia="convex" vertex="{values}"/>')
+        geoms.append(f'      <geom type="mesh" mesh="{name}-{number}"/>')
+    lines = [f'<mujoco model="{name}">', "  <asset>", *assets, "  </asset>", "  <worldbody>"]
+    lines += [f'    <body name="{name}">', *geoms, "    </body>", "  </worldbody>", "</mujoco>", ""]
+    return "\n".join(lines)
 
 
 def _glb(mesh: TriangleMesh) -> bytes:

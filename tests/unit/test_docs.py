@@ -75,7 +75,7 @@ EXTRAS = {
     "experiments": ("pandas", "matplotlib", "pupil_apriltags", "locus", "flip_evaluator", "jinja2"),
     "logs": ("mcap", "rosbags"),
     "live": ("foxglove", "cyclonedds"),
-    "mesh": ("coacd", "fast_simplification"),
+    "mesh": ("fast_simplification",),
     "sim": ("mujoco", "gymnasium", "small_gicp"),
     "usd": ("pxr",),
     "video": ("imageio_ffmpeg",),

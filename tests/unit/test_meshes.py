@@ -1,7 +1,6 @@
 """Meshes of scenes with closed forms, read back by trimesh and MuJoCo."""
 
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -10,7 +9,8 @@ from analytic_surfaces import leaves, plane, sphere
 from command_line import fails, prints_json
 
 import fidsplat as fs
-from fidsplat.formats.meshes import TriangleMesh, check_mesh_file, save_mesh
+from fidsplat.formats.convex_parts import convex_parts
+from fidsplat.formats.meshes import TriangleMesh, save_mesh
 from fidsplat.render import mesh
 from fidsplat.render.mesh import scene_mesh
 from fidsplat.render.tsdf import DistanceField
@@ -100,7 +100,7 @@ def test_a_field_of_known_distances():
 @pytest.mark.parametrize("ending", ["glb", "ply", "obj", "stl"])
 def test_files_are_read_by_trimesh(ball, tmp_path, ending):
     file = tmp_path / f"mesh.{ending}"
-    assert save_mesh(ball, file) == [file]
+    assert save_mesh(ball, file) == []
     again = trimesh.load(file, force="mesh")
     assert again.volume == pytest.approx(ball.volume, rel=1e-4)
     assert len(again.faces) == len(ball.faces)
@@ -133,16 +133,76 @@ def test_fewer_faces(ball):
         ball.simplified(3)
 
 
-def test_convex_parts_collide_in_mujoco(tmp_path):
-    """An L of two boxes has two parts; a ball that falls on the lower one rests on it."""
+def room_of_triangles(step=0.1):
+    """A room of 4 x 3 x 2 m without a ceiling, with a door of 1 x 2 m in a wall; normals point inside."""
+    points, faces = [], []
+    for origin, across, up in (
+        ((0, 0, 0), (4, 0, 0), (0, 3, 0)),
+        ((0, 0, 0), (0, 3, 0), (0, 0, 2)),
+        ((4, 3, 0), (0, -3, 0), (0, 0, 2)),
+        ((0, 3, 0), (4, 0, 0), (0, 0, 2)),
+        ((4, 0, 0), (-4, 0, 0), (0, 0, 2)),
+    ):
+        n, m = (round(max(np.abs(side)) / step) for side in (across, up))
+        u, v = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
+        door = (tuple(origin) == (0, 3, 0)) & (u >= 15) & (u < 25)
+        for i, j in zip(u[~door], v[~door], strict=True):
+            corners = [
+                np.add(origin, np.multiply(across, a / n)) + np.multiply(up, b / m)
+                for a, b in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))
+            ]
+            at = len(points)
+            points += corners
+            faces += [(at, at + 1, at + 2), (at, at + 2, at + 3)]
+    vertices, index = np.unique(np.round(points, 6), axis=0, return_inverse=True)
+    return TriangleMesh(vertices, index[np.array(faces)].astype(np.int32))
+
+
+def test_convex_parts_of_a_room_leave_its_inside_free(tmp_path):
+    """The walls and the floor collide, the room and its door do not, in MuJoCo."""
     mujoco = pytest.importorskip("mujoco", reason="the extra sim is not installed")
-    pytest.importorskip("coacd", reason="the extra mesh is not installed")
+    file = tmp_path / "room.xml"
+    parts = save_mesh(room_of_triangles(), file, 40)
+    assert 6 <= len(parts) <= 40
+    assert max(part.gaps.max() for part in parts) < 0.05
+    assert [path.name for path in tmp_path.iterdir()] == ["room.xml"]
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+
+    def free(origin, ray):
+        hit = np.zeros(1, np.int32)
+        return mujoco.mj_ray(model, data, np.array(origin, float), np.array(ray, float), None, 1, -1, hit)
+
+    middle = (1.2, 1.1, 1.0)
+    assert free(middle, (-1, 0, 0)) == pytest.approx(1.2, abs=0.05)
+    assert free(middle, (1, 0, 0)) == pytest.approx(2.8, abs=0.05)
+    assert free(middle, (0, -1, 0)) == pytest.approx(1.1, abs=0.05)
+    assert free(middle, (0, 1, 0)) == pytest.approx(1.9, abs=0.05)
+    assert free(middle, (0, 0, -1)) == pytest.approx(1.0, abs=0.05)
+    assert free((2.0, 1.5, 1.0), (0, 1, 0)) == -1  # through the door
+    few = save_mesh(room_of_triangles(), file, 3)
+    assert len(few) == 3
+    assert max(part.gaps.max() for part in few) > 0.5  # and the gaps say so
+
+
+def test_a_ball_and_a_box_are_one_part(ball):
+    box = trimesh.creation.box((0.2, 0.4, 1.0))
+    for solid in (ball, TriangleMesh(box.vertices + 7, box.faces.astype(np.int32))):
+        (part,) = convex_parts(solid.vertices, solid.faces, 1)
+        assert part.gaps.max() < 0.03 * np.ptp(solid.vertices, axis=0).max()
+        np.testing.assert_allclose(np.ptp(part.vertices, axis=0), np.ptp(solid.vertices, axis=0), rtol=0.05)
+
+
+def test_convex_parts_collide_in_mujoco(tmp_path):
+    """A box that falls on the lower arm of an L rests on it."""
+    mujoco = pytest.importorskip("mujoco", reason="the extra sim is not installed")
     tall, low = trimesh.creation.box((0.2, 0.4, 1.0)), trimesh.creation.box((0.8, 0.4, 0.2))
     low.apply_translation((0.5, 0.0, -0.4))
     both = trimesh.util.concatenate([tall, low])
-    files = save_mesh(TriangleMesh(both.vertices, both.faces.astype(np.int32)), tmp_path / "l.xml", 4)
-    assert 3 <= len(files) <= 5
-    spec = mujoco.MjSpec.from_file(str(files[0]))
+    arms = TriangleMesh(both.vertices, both.faces.astype(np.int32))
+    assert len(save_mesh(arms, tmp_path / "l.xml")) == 2
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "l.xml"))
     body = spec.worldbody.add_body(pos=[0.5, 0, 0.5])
     body.add_freejoint()
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1])
@@ -153,24 +213,13 @@ def test_convex_parts_collide_in_mujoco(tmp_path):
     assert data.body(2).xpos[2] == pytest.approx(-0.2, abs=0.02)
 
 
-def test_the_package_of_convex_parts_is_loaded_after_the_mesh_is_fused(tmp_path, monkeypatch):
-    """Once it is loaded, PoCL's compiler no longer finds its headers."""
-    (tmp_path / "coacd.py").write_text("raise AssertionError('loaded too early')")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "coacd", raising=False)
-    assert check_mesh_file(tmp_path / "l.xml") == tmp_path / "l.xml"
-    monkeypatch.setitem(sys.modules, "coacd", None)
-    with pytest.raises(fs.InputError, match=r"coacd must be installed.*fidsplat\[mesh\]"):
-        check_mesh_file(tmp_path / "l.xml")
-
-
 def test_the_command_writes_a_mesh(tmp_path, capsys):
     view = fs.Camera.look_at(96, 72, 1.0, (0, 0, 0), (0, 0, 1))
     fs.Scene([plane((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), 0.5)], camera=view).save(tmp_path / "wall.toml")
     (tmp_path / "path.tum").write_text("0 0 0 0 0 0 0 1\n1 0.2 0 0 0 0 0 1\n")
     words = ["convert", tmp_path / "wall.toml", tmp_path / "wall.stl", "--mesh", "--voxel", "0.05"]
     facts = prints_json(capsys, *words, "--cameras", tmp_path / "path.tum")
-    assert facts["files"] == [str(tmp_path / "wall.stl")]
+    assert facts["target"] == str(tmp_path / "wall.stl")
     again = trimesh.load(tmp_path / "wall.stl")
     assert facts["area_m2"] == pytest.approx(again.area, rel=1e-4)
     assert np.abs(again.vertices[:, 2] - 2.0).max() < 0.025
