@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
@@ -48,12 +49,12 @@ def convex_parts(vertices: np.ndarray, faces: np.ndarray, max_parts: int) -> lis
     corners = vertices[faces]
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     surface = _Surface(vertices, faces, corners.mean(1), crosses, THICKNESS * side)
-    heap = [(-np.inf, 0, np.arange(len(faces)), None)]
+    every = np.arange(len(faces))
+    heap: list[tuple[float, int, np.ndarray, ConvexPart]] = [(-np.inf, 0, every, surface.hull(every))]
     done: list[ConvexPart] = []
-    numbers = iter(range(1, 1 << 40))
+    numbers = count(1)  # of equal costs the first one is bisected first
     while heap and len(heap) + len(done) < max_parts:
         cost, _, part, hull = heapq.heappop(heap)
-        hull = surface.hull(part) if hull is None else hull
         halves = surface.bisections(part)
         if -cost <= TOLERANCE * side or not halves:
             done.append(hull)
@@ -62,7 +63,7 @@ def convex_parts(vertices: np.ndarray, faces: np.ndarray, max_parts: int) -> lis
         best = min(tried, key=lambda pair: sum(surface.cost(hull, half) for hull, half in pair))
         for hull, half in best:
             heapq.heappush(heap, (-surface.cost(hull, half), next(numbers), half, hull))
-    return done + [surface.hull(part) if hull is None else hull for _, _, part, hull in heap]
+    return done + [hull for _, _, _, hull in heap]
 
 
 class _Surface:
@@ -149,9 +150,9 @@ class _Surface:
         return np.cos(angles) * one + np.sin(angles) * other
 
 
-def _components(faces: np.ndarray, count: int) -> np.ndarray:
+def _components(faces: np.ndarray, vertices: int) -> np.ndarray:
     """Number of the connected component of each face."""
-    labels = np.arange(count)
+    labels = np.arange(vertices)
     while True:
         smallest = labels[faces].min(axis=1)
         new = labels.copy()
