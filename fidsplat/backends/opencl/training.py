@@ -26,8 +26,9 @@ _PANEL, _STRIP = 128, 64
 """values of a row and number of rows per work-item on CPUs (kernels/opencl/train/loss_strips.cl)"""
 _SUM_GROUPS, _SUM_ITEMS = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
-_EXPOSURE_GROUPS = 256
-"""work-groups of the sums for the gradient of the exposure"""
+_EXPOSURE_GROUPS, _EXPOSURE_ITEMS = 256, 96
+"""work-groups of the kernels of exposures, and their work-items (EXPOSURE_ITEMS of
+kernels/opencl/train/exposure.cl)"""
 _ROWS_PER_ITEM = 4
 """rows per work-item of the vertical passes (ROWS_PER_ITEM of kernels/opencl/train/loss.cl)"""
 _MOMENTS = ("first_", "second_")
@@ -287,7 +288,7 @@ class OpenCLTraining:
                 **{"images": self._allocate_images(height, columns)},
                 "image_stride": stride * (height + 2 * _MARGIN_ROWS),
             }
-            exposures = (_EXPOSURE_GROUPS * _GROUP,), (_GROUP,), values
+            exposures = (_EXPOSURE_GROUPS * _EXPOSURE_ITEMS,), (_EXPOSURE_ITEMS,), values
             backward = [self._launch_of("exposure_backward", *exposures)] if exposed else []
             if in_strips:
                 kernels = "loss_strips", "loss_strips_backward"
