@@ -46,8 +46,3 @@
         splat_grad.grad_camera[8] = (dot3(grad_xs, depths) + grad_p.x * pz) / view->focal_x;
         splat_grad.grad_camera[9] = (dot3(grad_ys, depths) + grad_p.y * pz) / view->focal_y;
     }
-//@ intrinsics
-        // as in `View.of`
-        real beyond_x = REAL(0.15) * view->width / values[0], beyond_y = REAL(0.15) * view->height / values[1];
-        view->ewa_clamp[0] = values[2] / values[0] + beyond_x; view->ewa_clamp[1] = (view->width - values[2]) / values[0] + beyond_x;
-        view->ewa_clamp[2] = values[3] / values[1] + beyond_y; view->ewa_clamp[3] = (view->height - values[3]) / values[1] + beyond_y;

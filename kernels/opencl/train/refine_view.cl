@@ -63,7 +63,7 @@ kernel __attribute__((reqd_work_group_size(REFINE_ITEMS, 1, 1))) void refine_vie
 }
 
 // Index space: one work-group of INTRINSICS_ITEMS. Updates: a row of the intrinsics, its moments and sums, and the intrinsics of all views that have
-// them.
+// them. The limits of EWA outside of the image remain those of the data set's intrinsics.
 #define INTRINSICS_ITEMS 64
 kernel __attribute__((reqd_work_group_size(INTRINSICS_ITEMS, 1, 1))) void refine_intrinsics(
 //@@ arguments refine_intrinsics
@@ -85,6 +85,5 @@ kernel __attribute__((reqd_work_group_size(INTRINSICS_ITEMS, 1, 1))) void refine
         global View *view = views + i;
         view->focal_x = values[0]; view->focal_y = values[1]; view->center_x = values[2]; view->center_y = values[3];
         for (int k = 0; k < 4; k++) lenses[4 * i + k] = (float)values[k];
-//@@ intrinsics
     }
 }
