@@ -246,27 +246,27 @@ def _tube(line: np.ndarray, radius: float, color: Sequence[float]) -> Mesh:
 def _blade(
     rng: np.random.Generator,
     foot: np.ndarray,
-    rotation: float,
+    azimuth: float,
     length: float,
-    wide: float,
+    aspect: float,
     color: np.ndarray,
     rise: float = 0.35,
     droop: float = 1.0,
     lobes: float = 0.08,
     waves: float = 0.05,
 ) -> Mesh:
-    """Leaf towards the azimuth `turn` [rad], folded and darker at its midrib. Its width is `wide` times its
-    length."""
+    """Leaf that grows from its foot towards an azimuth [rad], folded and darker at its midrib. aspect: width
+    divided by length."""
     rows, columns = 11, 9
     u, v = np.linspace(0, 1, rows)[:, None], np.linspace(-1, 1, columns)
-    half = wide / 2 * length * np.sin(math.pi * np.clip(u, 0.02, 0.99) ** 0.75) ** 0.8
+    half = aspect / 2 * length * np.sin(math.pi * np.clip(u, 0.02, 0.99) ** 0.75) ** 0.8
     half = half * (1 + lobes * np.cos(6 * math.pi * u))
     middle = _arc(length, rise, droop, rows)[:, None]
     phase = rng.uniform(0, 2 * math.pi)
     lift = half * (0.25 * np.abs(v) + waves * np.abs(v) ** 2 * np.sin(4 * math.pi * u + 3 * v + phase))
     points = middle + np.stack([0 * lift, half * v, lift], axis=-1)
     light = 1 + 0.18 * np.abs(v) - 0.08 * np.cos(8 * math.pi * (u - 0.3 * np.abs(v)))
-    return _grid(_placed(points, foot, rotation), np.clip(color * light[..., None], 0, 1))
+    return _grid(_placed(points, foot, azimuth), np.clip(color * light[..., None], 0, 1))
 
 
 def _ball(middle: np.ndarray, radii: Sequence[float], color: np.ndarray) -> Mesh:

@@ -90,9 +90,9 @@ def first_sample(number: int, view: View) -> int:
     return number * (view.tiles_x * view.tile_w) * (view.tiles_y * view.tile_h)
 
 
-def struct_of(name: str, words: str, fields: dict):
-    """Make a struct with `fields` (name: type)."""
-    return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))
+def struct_of(name: str, doc: str, fields: dict):
+    """Make a struct with a docstring and `fields` (name: type)."""
+    return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": doc, "__module__": __name__}))
 
 
 def with_numbers(text: str, numbers: dict[str, int]) -> str:
