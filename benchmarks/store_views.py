@@ -98,7 +98,7 @@ def along(store: fs.Store, renderer: fs.Renderer, arguments, error: float) -> di
         begun = time.perf_counter()
     times, splats = np.transpose(made)
     PROGRESS.print(f"path, {error:.4f}: median {np.median(times):.0f} ms, largest {times.max():.0f} ms")
-    return {"error": error, "splats": len(store), "ms": times.tolist(), "drawn": splats.tolist()}
+    return {"error": error, "splats": len(store), "ms": times.tolist(), "rendered": splats.tolist()}
 
 
 def measure(store: fs.Store, renderer: fs.Renderer, arguments) -> list[dict]:
@@ -119,7 +119,7 @@ def measure(store: fs.Store, renderer: fs.Renderer, arguments) -> list[dict]:
             selection = select(splats, [view], features, splats.cell_sizes(quality))
             chosen = time.perf_counter() - begun
             visible = sum(int(store.counts(np.array(nodes)).sum()) for nodes in selection.nodes if nodes)
-            row = {"view": name, "splats": len(store), "error": error, "drawn": visible}
+            row = {"view": name, "splats": len(store), "error": error, "rendered": visible}
             row |= {"nodes": len(selection), "choose_s": chosen}
             if visible <= arguments.exact:
                 resident = renderer.upload(store)
@@ -188,7 +188,7 @@ def main() -> None:
                 f"{row['splats']:,}",
                 row["view"],
                 f"{row['error']:.4}",
-                f"{row['drawn']:,}",
+                f"{row['rendered']:,}",
                 *(f"{value:.2f}" for value in row.get("s", ())),
                 *([] if "s" in row else ["-", "-", "-"]),
                 f"{row['off']:.4f}" if "off" in row else "-",

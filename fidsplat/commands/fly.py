@@ -175,7 +175,7 @@ class Fly(RenderInput):
     def _report(self, folder: FlightFolder, sheet: Path, rendered: int, seconds: float) -> int:
         frames = len(folder.flight)
         facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
-        facts |= {"drawn": rendered, "seconds": seconds, "folder": str(folder.folder)}
+        facts |= {"rendered": rendered, "seconds": seconds, "folder": str(folder.folder)}
         facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
         facts["bop"] = self.bop
         earlier = f" ({frames - rendered} of an earlier run)" if rendered < frames else ""

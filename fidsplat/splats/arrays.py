@@ -102,10 +102,10 @@ def real_numbers(name: str, value) -> np.ndarray:
 def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if array.shape == shape:
         return
-    wanted = "(n, 3)" if name == "means" else str(shape)
+    required = "(n, 3)" if name == "means" else str(shape)
     if name == "scales":
-        wanted += f" or {(shape[0], 3)}"
-    raise InputError(f"{name} must have the shape {wanted}, got shape {array.shape}")
+        required += f" or {(shape[0], 3)}"
+    raise InputError(f"{name} must have the shape {required}, got shape {array.shape}")
 
 
 def check_color_range(colors: np.ndarray) -> np.ndarray:

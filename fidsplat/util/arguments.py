@@ -172,8 +172,8 @@ def parse_setting(what: str, kind: type, name: str, text: str) -> Any:
                 return _numbers(text)
         return convert(text)
     except ValueError:
-        wanted = {int: "a whole number", float: "a number"}.get(convert, "numbers separated by spaces")
-        raise InputError(f"{what}: {name} must be {wanted}, got {text!r}") from None
+        required = {int: "a whole number", float: "a number"}.get(convert, "numbers separated by spaces")
+        raise InputError(f"{what}: {name} must be {required}, got {text!r}") from None
 
 
 def _numbers(text: str) -> float | tuple[float, ...]:

@@ -233,7 +233,7 @@ def local_search(
                     best, best_gain = int(k), candidate_gain
             if best == chosen[place]:
                 continue
-            # computed anew, as downdates lose digits after precise tags
+            # computed again, as downdates lose digits after precise tags
             tried = [*chosen[:place], best, *chosen[place + 1 :]]
             exact, moved = _with(covariance, candidates, tried, objective)
             if exact > value:

@@ -181,7 +181,7 @@ def test_a_flight_goes_on_where_it_was(here, capsys):
     capsys.readouterr()
     assert fly("--rate", "4", "--json") == 0
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["frames"], printed["drawn"]) == (5, 2)
+    assert (printed["frames"], printed["rendered"]) == (5, 2)
     again = {file.name: file.stat().st_mtime_ns for file in (here / "out" / "rgb").iterdir()}
     assert sorted(again) == sorted(first)
     assert sorted(name for name in first if first[name] != again[name]) == ["000001.png", "000004.png"]
