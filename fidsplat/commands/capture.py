@@ -16,6 +16,9 @@ from fidsplat.photographs.settings import CaptureSettings
 if TYPE_CHECKING:
     from fidsplat.photographs.steps import Captured
 
+MISSING = 12
+"""number of photographs without a camera that are printed"""
+
 
 @repeatable
 @dataclass
@@ -63,6 +66,7 @@ def _facts(captured: Captured) -> dict[str, Any]:
         "reprojection_px": captured.model.reprojection,
         "metric": captured.scale_error is not None,
         "readout_px": captured.readout,
+        "doubts": captured.doubts,
         "renamed": {str(file): str(new) for file, new in captured.files.renamed},
         "cameras": [
             {"scene": str(file), "size": [camera.width, camera.height], "fx": camera.fx, "photographs": count}
@@ -94,7 +98,10 @@ def _words(captured: Captured, facts: dict[str, Any], out: str, lens: str) -> li
         f"{facts['registered']} of {facts['photographs']} photographs, {facts['points']:,} points, "
         f"reprojection error {facts['reprojection_px']:.2f} px"
     ]
-    lines += [f"no camera for {name}: {reason}" for name, reason in captured.missing]
+    lines += [f"no camera for {name}: {reason}" for name, reason in captured.missing[:MISSING]]
+    if len(captured.missing) > MISSING:
+        lines.append(f"no camera for {len(captured.missing) - MISSING} more; --json lists them")
+    lines += captured.doubts
     if len(captured.files.cameras) > 1:
         lines += [
             f"{file.name}: {camera.width} x {camera.height}, fx {camera.fx:.0f} px, {count} photographs"

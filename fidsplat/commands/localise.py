@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from fidsplat.commands.options import Device, Json, Overwrite, parse_numbers
-from fidsplat.commands.output import console, report
+from fidsplat.commands.output import console, report, steps_shown
 from fidsplat.commands.scenes import load_scene_file
 from fidsplat.util.errors import InputError
 from fidsplat.util.files import path_of, refuse_existing
@@ -82,25 +82,28 @@ class Localise:
         results: dict[str, Localisation | None] = {}
         reasons: dict[str, str] = {}
         previous: list[Camera] = []
-        for path in self.images:
-            for name, image in read_images(path, reasons):
-                results |= dict.fromkeys(reasons.keys() - results.keys())
-                try:
-                    localised = fs.localise(
-                        image,
-                        scene,
-                        None if start is None else camera.with_pose(camera_to_world=(start[:3], start[3:])),
-                        candidates=[*previous, *candidates],
-                        max_side=self.max_side,
-                        renderer=renderer,
-                        resident=resident,
-                    )
-                except InputError as error:
-                    results[name], reasons[name] = None, str(error)
-                    continue
-                results[name] = localised
-                previous = [localised.camera] if localised.found else []
-        results |= dict.fromkeys(reasons.keys() - results.keys())
+        with steps_shown(console(True), "localising") as show:
+            for path in self.images:
+                for name, image in read_images(path, reasons):
+                    show(f"localising {name}")
+                    results |= {file: None for file in reasons if file not in results}
+                    at = None if start is None else camera.with_pose(camera_to_world=(start[:3], start[3:]))
+                    try:
+                        localised = fs.localise(
+                            image,
+                            scene,
+                            at,
+                            candidates=[*previous, *candidates],
+                            max_side=self.max_side,
+                            renderer=renderer,
+                            resident=resident,
+                        )
+                    except InputError as error:
+                        results[name], reasons[name] = None, str(error)
+                        continue
+                    results[name] = localised
+                    previous = [localised.camera] if localised.found else []
+        results |= {file: None for file in reasons if file not in results}
         if not any(results.values()):
             different = list(dict.fromkeys(reasons.values()))[:3]
             raise InputError(f"{', '.join(self.images)} and {self.scene}: {'; '.join(different)}")

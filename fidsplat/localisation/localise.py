@@ -179,8 +179,8 @@ def localise(
     if not starts:
         if not len(candidates):
             raise InputError(
-                "localisation must have an initial pose, got no start, no marker of the scene in the image "
-                "and no candidates; give start= or candidates="
+                "localisation must have an initial pose, got no start, no marker in the image that occurs "
+                "once in the scene and no candidates; give start= or candidates="
             )
         source = "candidates"
 

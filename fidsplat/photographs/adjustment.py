@@ -111,8 +111,8 @@ def adjust(cameras: Sequence[Camera], views: Sequence[TagView], sizes: Mapping[s
                 if len(found) - len(good) > MAX_REJECTED * len(found) or len(good) < 2:
                     raise InputError(
                         f"{tag} must be at one place in all photographs, got {len(found)} detections that "
-                        "contradict each other; remove photographs of a second copy of the tag, or in which "
-                        "it was moved"
+                        "contradict each other; remove photographs of a second copy of the tag or in which "
+                        "it was moved, and take more photographs if their cameras are wrong"
                     )
                 unit, moved, error = _solve(cameras, good, sizes, unit, {tag: poses[tag]})
                 poses |= moved

@@ -12,6 +12,8 @@ from fidsplat.cameras import Camera
 PITCHED = 0.002
 """weight of the cameras' mean up direction, which determines the vertical if the x axes of all cameras are
 parallel"""
+MIN_SPREAD = 0.05
+"""minimum variance of the cameras' x axes, across their mean, that determines the vertical: 13 degrees"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,14 @@ def world_frame(
     else:
         origin = np.mean([camera.position for camera in cameras], axis=0) if middle is None else middle
     return WorldFrame(rotation, np.asarray(origin, np.float64), scale)
+
+
+def leaning(cameras: Sequence[Camera], up: np.ndarray) -> float:
+    """Angle [rad] between a vertical and that of the cameras' x axes; 0 if these are too parallel for one."""
+    across = np.array([camera.world_to_camera[0, :3] for camera in cameras])
+    if np.linalg.eigvalsh(across.T @ across / len(across))[1] < MIN_SPREAD:
+        return 0.0
+    return float(np.arccos(np.clip(camera_up(cameras) @ up, -1, 1)))
 
 
 def camera_up(cameras: Sequence[Camera]) -> np.ndarray:

@@ -23,6 +23,11 @@ from fidsplat.util.progress import Progress
 from fidsplat.vision.video_frames import choose_frames, measure_frames
 
 MIN_PHOTOS = 3
+OTHER_SUFFIXES = (
+    *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"),
+)
+"""suffixes of photographs that OpenCV does not read; they are reported instead of ignored"""
 _QUALITY = 97
 
 
@@ -37,12 +42,17 @@ def source_files(source: Path) -> list[Path]:
     files = sorted(
         file
         for file in source.iterdir()
-        if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+        if file.suffix.lower() in (*IMAGE_SUFFIXES, *OTHER_SUFFIXES) and not file.name.startswith(".")
     )
     if len(files) < MIN_PHOTOS:
+        below = any(file.suffix.lower() in IMAGE_SUFFIXES for file in source.glob("*/*"))
+        remedy = (
+            "put the photographs of its subfolders into one folder"
+            if below
+            else "take 20 to 200 of the scene, each overlapping the one before by two thirds"
+        )
         raise InputError(
-            f"a capture must have at least {MIN_PHOTOS} photographs, got {len(files)} in {source}; take 20 "
-            "to 200 of the scene, each overlapping the one before by two thirds"
+            f"a capture must have at least {MIN_PHOTOS} photographs, got {len(files)} in {source}; {remedy}"
         )
     return files
 
@@ -62,7 +72,11 @@ def copy_photos(files: Sequence[Path], folder: Path, progress: Progress) -> list
         try:
             data = read_input(file)
             if data and not declared_pixels(data):
-                raise InputError(f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file")
+                raise InputError(
+                    f"cannot read {file} as an image; convert it to JPEG"
+                    if file.suffix.lower() in OTHER_SUFFIXES
+                    else f"cannot read {file} as an image; give a PNG, JPEG, BMP, TIFF or WebP file"
+                )
             image, key = read_image(file), name_key(file.name)
         except InputError as error:
             skipped.append((file.name, str(error)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ from fidsplat.photographs.dataset import (
     write_images,
     write_model,
 )
-from fidsplat.photographs.frame import WorldFrame, world_frame
+from fidsplat.photographs.frame import WorldFrame, leaning, world_frame
 from fidsplat.photographs.mapping import (
     Model,
     extract,
@@ -50,6 +51,11 @@ WRITTEN = "written"
 OUTPUTS = "images", "masks", "sparse", "dataset.json", "scene.toml", PHOTOGRAPHS
 
 
+MIN_POINTS, MAX_CORNERS, MAX_SCALE_ERROR, MAX_LEANING = 20, 1.0, 0.005, math.radians(10)
+"""limits of a reliable model: points for each photograph; error of tags' corners in pixels, and beyond twice
+the features' error; standard error of the scale; angle between the verticals of --up and of the cameras"""
+
+
 @dataclass(frozen=True, eq=False)
 class Captured:
     """A data set made from photographs."""
@@ -68,6 +74,31 @@ class Captured:
     """relative standard error of the scale; None if lengths are not in metres"""
     readout: float
     """displacement of rows by motion during the readout [px]; 0 unless a rolling shutter is likely"""
+    lean: float
+    """angle [rad] between the vertical and that of the cameras' horizontal axes"""
+
+    @property
+    def doubts(self) -> list[str]:
+        """Reasons to doubt the cameras, the scale or the vertical."""
+        doubts, points = [], len(self.model.points)
+        cameras = "the cameras may be wrong: {}; take more photographs, with more overlap"
+        if points < MIN_POINTS * len(self.model.names):
+            doubts.append(cameras.format(f"only {points} points in {len(self.model.names)} photographs"))
+        if self.adjustment is not None:
+            rms = self.adjustment.rms
+            if rms > max(MAX_CORNERS, 2 * self.model.reprojection):
+                doubts.append(cameras.format(f"corners of tags are {rms:.1f} px from their projections"))
+        if self.scale_error is not None and self.scale_error > MAX_SCALE_ERROR:
+            doubts.append(
+                f"the scale has a standard error of {100 * self.scale_error:.2g} %; take more photographs of "
+                "the tags, or pick points far from each other"
+            )
+        if self.lean > MAX_LEANING:
+            doubts.append(
+                f"the vertical of --up is {math.degrees(self.lean):.0f} degrees from that of the cameras; "
+                "give a tag that is upright on a wall, or flat"
+            )
+        return doubts
 
 
 def photographs_to_scene(
@@ -170,6 +201,7 @@ def photographs_to_scene(
         tuple(missing),
         picked_error if adjustment is None else adjustment.scale_error,
         readout,
+        0.0 if up is None else leaning(pinholes, frame.rotation[2]),
     )
 
 

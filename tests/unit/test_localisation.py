@@ -339,7 +339,7 @@ def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
     facts = results.pop("photo")
     assert facts["found"]
     for name, reason in (
-        ("blank", "no marker of the scene"),
+        ("blank", "no marker in the image"),
         ("turned", "64 x 48 pixels, got 48 x 64"),
         ("torn", "cannot read"),
     ):
@@ -394,7 +394,7 @@ def test_few_pixels_do_not_determine_a_covariance(renderer, room):
 
 def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     scene, resident, image = room
-    with pytest.raises(fs.InputError, match="initial pose, got no start, no marker of the scene"):
+    with pytest.raises(fs.InputError, match="initial pose, got no start, no marker in the image"):
         fs.localise(image, scene, renderer=renderer, resident=resident)
     with pytest.raises(fs.InputError, match="camera's size, 64 x 48 pixels, got 60 x 48; give the image"):
         fs.localise(image[:, :60], scene, scene.camera, renderer=renderer, resident=resident)

@@ -4,6 +4,7 @@ import importlib
 import math
 import sys
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,14 +15,15 @@ from fidsplat import InputError
 from fidsplat.cameras import BrownConrady
 from fidsplat.images.exif import ORIENTATION, read_exif, with_exif
 from fidsplat.images.files import read_image
-from fidsplat.photographs.adjustment import TagView, adjust
-from fidsplat.photographs.frame import camera_up, world_frame
+from fidsplat.photographs.adjustment import Adjustment, TagView, adjust
+from fidsplat.photographs.dataset import Written
+from fidsplat.photographs.frame import camera_up, leaning, world_frame
 from fidsplat.photographs.mapping import Model
 from fidsplat.photographs.photos import camera_groups, copy_photos
 from fidsplat.photographs.picks import parse_scale, scale_of
 from fidsplat.photographs.rolling_shutter import MIN_DISPLACEMENT, MIN_FRACTION, readout_motion
 from fidsplat.photographs.settings import CaptureSettings
-from fidsplat.photographs.steps import photographs_to_scene
+from fidsplat.photographs.steps import Captured, photographs_to_scene
 from fidsplat.photographs.tags import box_of, module_colors, parse_tags, same_tag
 from fidsplat.scenes import PlacedMarker
 from fidsplat.splats.rotations import quaternion_to_matrix, rigid_matrix
@@ -115,6 +117,43 @@ def test_cameras_held_level_give_the_vertical():
     np.testing.assert_allclose(camera_up(cameras), (0, 0, 1), atol=0.002)
     alike = [level(0.3, roll, pitch=-0.2) for roll in (-0.1, 0.1)]  # one azimuth does not determine the pitch
     assert camera_up(alike)[2] > 0.95
+
+
+def test_a_leaning_vertical_is_noticed_where_the_cameras_have_one():
+    cameras = [level(azimuth, pitch=0.4) for azimuth in np.linspace(0, 1.5, 6)]
+    leaning_up = np.array([math.sin(0.5), 0, math.cos(0.5)])
+    assert leaning(cameras, leaning_up) == pytest.approx(0.5, abs=0.03)
+    assert leaning(cameras, np.array([0, 0, 1.0])) < 0.03
+    alike = [level(0.3, roll, pitch=0.6) for roll in (-0.1, 0.1)]  # they do not determine the pitch
+    assert leaning(alike, leaning_up) == 0
+
+
+def test_a_model_that_is_not_reliable_has_doubts():
+    points, camera = np.zeros((400, 3)), fs.Camera.pinhole(640, 480, 500, 500, 320, 240)
+    points[:, 2] = 2
+    pixels, track = camera.project(points) + 0.3, np.arange(400)
+    names = tuple("abcdefgh")
+
+    def doubts(points=points, corners=0.3, error=0.001, lean=0.0):
+        model = Model(
+            names,
+            (camera,),
+            points,
+            points.astype(np.uint8),
+            (pixels[: len(points)],),
+            (track[: len(points)],),
+        )
+        adjusted = Adjustment(1.0, error, {}, corners, (), (), {})
+        frame = world_frame([level(0.2)], 1.0)
+        return Captured(
+            Written(Path(), (), ()), 8, model, frame, adjusted, (), (), (), error, 0.0, lean
+        ).doubts
+
+    assert doubts() == []
+    assert "only 100 points in 8 photographs" in doubts(points[:100])[0]
+    assert "corners of tags are 2.1 px" in doubts(corners=2.06)[0]
+    assert "standard error of 3 %" in doubts(error=0.03)[0]
+    assert "30 degrees from that of the cameras" in doubts(lean=math.radians(30))[0]
 
 
 @pytest.mark.parametrize("axis", range(3))

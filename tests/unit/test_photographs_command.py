@@ -233,6 +233,7 @@ def test_edited_scene_files_and_splats_of_other_poses_are_renamed(photos, captur
     out = tmp_path / "out"
     shutil.copytree(captured[0], out)
     words = [photos, "-o", out, *ARGUMENTS, "--up", "apriltag:36h11:9"]
+    prints_json(capsys, "capture", *words)
     edited = (
         (out / "scene.toml").read_text().replace("background = [0.0, 0.0, 0.0]", "background = [1.0, 0, 0]")
     )
@@ -323,6 +324,20 @@ def test_damaged_photographs_are_skipped_unless_too_few_are_left(photos, tmp_pat
     assert (status, "photographs that can be read, got 2 of 6: cannot read" in message) == (2, True)
     files[2].write_bytes((photos / files[2].name).read_bytes())
     assert prints_json(capsys, "capture", copies, "-o", tmp_path / "few")["photographs"] == 6
+
+
+def test_photographs_of_other_formats_and_in_subfolders_are_named(photos, tmp_path, capsys):
+    phone = tmp_path / "phone"
+    shutil.copytree(photos, phone / "album")
+    for i in range(2):
+        (phone / f"IMG_{i}.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    status, message = fails(capsys, "capture", phone, "-o", tmp_path / "out")
+    assert (status, "put the photographs of its subfolders into one folder" in message) == (2, True)
+    for file in (phone / "album").iterdir():
+        file.rename(phone / file.name)
+    facts = prints_json(capsys, "capture", phone, "-o", tmp_path / "out")
+    assert (facts["photographs"], facts["registered"]) == (7, 5)
+    assert facts["missing"]["IMG_0.HEIC"].endswith("IMG_0.HEIC as an image; convert it to JPEG")
 
 
 def test_each_camera_of_the_photographs_has_a_scene_file(photos, tmp_path, capsys):
