@@ -111,45 +111,49 @@ def reference_images(
     return pipeline.render_view(resident, view).arrays_of(0)
 
 
-def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
+def compare(
+    images: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray], outputs
+) -> list[Difference]:
     """Compare images of a device with those of `reference_images`, for each of `outputs`."""
-    risky = float((truth["error_bound"] > RISKY).mean())
+    risky = float((reference["error_bound"] > RISKY).mean())
     differences = []
     for name in outputs:
         errors = _flips if declared_output(name).discontinuous else _errors
-        worst, beyond = errors(name, images[name], truth)
+        worst, beyond = errors(name, images[name], reference)
         finite = bool(np.isfinite(images[name]).all())
         differences.append(Difference(name, worst, beyond - tolerance_of(name), risky, finite))
     return differences
 
 
-def _errors(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
+def _errors(name: str, image: np.ndarray, reference: Mapping[str, np.ndarray]) -> tuple[float, float]:
     """Largest error of a continuous output, and largest error beyond the error bound."""
-    want, certified = truth[name], _error_bound(name, truth)
-    error = np.abs(image - want)
-    if error.ndim > truth["error_bound"].ndim:
+    expected, bound = reference[name], _error_bound(name, reference)
+    error = np.abs(image - expected)
+    if error.ndim > reference["error_bound"].ndim:
         error = error.max(-1)
     # parallel rays have negative depths behind the camera's plane
-    size = np.maximum(np.abs(want), 1e-30) if declared_output(name).relative else 1.0
-    return float((error / size).max(initial=0.0)), float(((error - certified) / size).max(initial=0.0))
+    size = np.maximum(np.abs(expected), 1e-30) if declared_output(name).relative else 1.0
+    return float((error / size).max(initial=0.0)), float(((error - bound) / size).max(initial=0.0))
 
 
-def _error_bound(name: str, truth: Mapping[str, np.ndarray]) -> np.ndarray:
+def _error_bound(name: str, reference: Mapping[str, np.ndarray]) -> np.ndarray:
     """Change of an output that float32 may cause in each pixel."""
     if name not in ("rgb", "alpha"):
-        return truth[f"error_bound_{name}"]
-    brightest = max(1.0, float(np.abs(truth["rgb"]).max(initial=1.0)))
-    in_colors = truth["error_bound"] * brightest
-    return truth.get("error_bound_rgb", in_colors) if name == "rgb" else in_colors
+        return reference[f"error_bound_{name}"]
+    brightest = max(1.0, float(np.abs(reference["rgb"]).max(initial=1.0)))
+    in_colors = reference["error_bound"] * brightest
+    return reference.get("error_bound_rgb", in_colors) if name == "rgb" else in_colors
 
 
-def _flips(name: str, image: np.ndarray, truth: Mapping[str, np.ndarray]) -> tuple[float, float]:
-    """Fraction of pixels in which a discontinuous output differs, and fraction that differs without a
+def _flips(name: str, image: np.ndarray, reference: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Fraction of pixels in which a discontinuous output differs, and fraction that differs without an
     error bound."""
-    output, want = declared_output(name), truth[name]
-    limit = output.tolerance * want if output.relative else truth.get(f"{name}_bound", output.tolerance)
-    differs = np.abs(image - want) > limit
-    may_flip = truth.get(f"{name}_may_flip", np.zeros(differs.shape, bool))
+    output, expected = declared_output(name), reference[name]
+    limit = (
+        output.tolerance * expected if output.relative else reference.get(f"{name}_bound", output.tolerance)
+    )
+    differs = np.abs(image - expected) > limit
+    may_flip = reference.get(f"{name}_may_flip", np.zeros(differs.shape, bool))
     return float(differs.mean()), float((differs & ~may_flip).mean())
 
 

@@ -75,7 +75,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
     )
     got = backend.probe().arithmetic(exponents, fractions, above, below)
     wide_above, wide_below = above.astype(np.longdouble), below.astype(np.longdouble)
-    truth = {
+    exact = {
         "exp": np.exp(exponents),
         "log": np.log(fractions),
         "division": above / below,
@@ -88,16 +88,16 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         "fast_log": np.log(fractions),
         "reciprocal": 1 / below,
     }
-    ulp = {name: worst(got[name], truth[name]) for name in truth if name in got}
+    ulp = {name: worst(got[name], exact[name]) for name in exact if name in got}
     denormals = bool(got["denormal"][0] > 0 and got["denormal"][1] == np.finfo(np.float32).tiny)
     return Arithmetic(renderer.device.float64, denormals, ulp)
 
 
-def worst(got: np.ndarray, truth: np.ndarray) -> float:
+def worst(got: np.ndarray, exact: np.ndarray) -> float:
     """Largest error of `got` in ulp of its type, both (n,); infinite if a value is not finite."""
-    spacing = np.spacing(np.abs(truth).astype(got.dtype))
+    spacing = np.spacing(np.abs(exact).astype(got.dtype))
     # np.max alone would not report infinity for a NaN
-    errors = np.abs(got - truth) / spacing
+    errors = np.abs(got - exact) / spacing
     return float(errors.max()) if np.isfinite(errors).all() else float("inf")
 
 

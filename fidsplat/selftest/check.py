@@ -154,8 +154,8 @@ def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tupl
 
 
 def _compared(renderer: Renderer, spec: FrameSpec, result: CaseResult, worst: Worst | None) -> Worst | None:
-    frame, truth = render(renderer, spec), reference_images(spec)
-    for difference in compare(frame, truth, spec.outputs):
+    frame, expected = render(renderer, spec), reference_images(spec)
+    for difference in compare(frame, expected, spec.outputs):
         name = difference.output
         raise_to(result.beyond_bound, name, difference.beyond_bound)
         raise_to(result.largest, name, difference.error)
@@ -168,7 +168,7 @@ def _compared(renderer: Renderer, spec: FrameSpec, result: CaseResult, worst: Wo
             words = f"{result.case.name}, frame {result.frames}, {name}: error {difference.error:.0e}"
             words += f", beyond the bound {difference.beyond_bound:.0e}"
             rgb = np.array(frame["rgb"], dtype=np.float64)
-            worst = Worst(words, rgb, truth["rgb"], truth["error_bound"], rank)
+            worst = Worst(words, rgb, expected["rgb"], expected["error_bound"], rank)
     return worst
 
 

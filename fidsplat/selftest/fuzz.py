@@ -174,9 +174,9 @@ class FuzzState:
     def add(self, seed: int, renderer: Renderer) -> None:
         """Render the scene of the next seed and compare it."""
         spec = scene_of(seed)
-        truth = reference_images(spec)
+        expected = reference_images(spec)
         failed = False
-        for difference in compare(render(renderer, spec), truth, ALL_OUTPUTS):
+        for difference in compare(render(renderer, spec), expected, ALL_OUTPUTS):
             name = difference.output
             failed |= not (difference.finite and difference.excess <= 0)
             errors = (self.beyond_bound, difference.beyond_bound), (self.largest, difference.error)
@@ -187,8 +187,8 @@ class FuzzState:
         if failed:
             self.failing.append(seed)
         self.scenes, self.splats = seed + 1, self.splats + len(spec.cloud)
-        self.pixels += truth["error_bound"].size
-        self.risky += int((truth["error_bound"] > RISKY).sum())
+        self.pixels += expected["error_bound"].size
+        self.risky += int((expected["error_bound"] > RISKY).sum())
 
 
 def fuzz_run(renderer: Renderer, splats: int, file: Path | None = None) -> Iterator[FuzzState]:

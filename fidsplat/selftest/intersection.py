@@ -67,8 +67,8 @@ def grazing_errors(renderer: Renderer, tilt: float, sigma: int, quality: Quality
     covered = np.nonzero(alpha > 0)
     sampled = generator.permutation(len(covered[0]))[:4000]
     covered = covered[0][sampled], covered[1][sampled]
-    truth = reference_images(spec, covered)["alpha"]
-    errors = np.abs(alpha[covered] - truth)[truth > 0.004]
+    expected = reference_images(spec, covered)["alpha"]
+    errors = np.abs(alpha[covered] - expected)[expected > 0.004]
     return errors
 
 
