@@ -50,14 +50,14 @@ def main() -> None:
     options = parser.parse_args()
     cloud = fs.marker("apriltag:36h11:5", size=0.16).cloud
     cameras = [
-        fs.Camera.look_at(64, 48, 1.0, position=(0.001 * k, 0, -0.4), target=(0, 0, 0)) for k in range(3)
+        fs.Camera.look_at(64, 48, 1.0, position=(0.001 * k, 0, -0.4), target=(0, 0, 0)) for k in range(4)
     ]
     renderer = fs.Renderer(options.device)
     counts = {"first frame": entered(lambda: renderer.render(cloud, cameras[0]))}
     resident = renderer.upload(cloud)
-    for camera in cameras[:2]:  # rendered, then recorded
+    for camera in cameras[:3]:  # rendered, recorded, and replayed
         renderer.render(resident, camera).wait()
-    counts["replayed frame"] = entered(lambda: renderer.render(resident, cameras[2]))
+    counts["replayed frame"] = entered(lambda: renderer.render(resident, cameras[3]))
     for frame, calls in counts.items():
         named = sum(not code.co_name.startswith("<") for code in calls)
         files = len({code.co_filename for code in calls})

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.view import FAR_EYE, View, rotated
+from fidsplat.backends.view import FAR_EYE, View, moved_pose, rotated
 
 _SHARED = (
     *("width", "height", "samples", "sensor", "background", "fog_density", "environment_map"),
@@ -117,14 +117,9 @@ class ViewBatch:
             eye = centre - FAR_EYE * rotation[:, 2] if view.parallel else centre
         rotations, translations, eyes = [rotation], [translation], [eye]
         for motion in groups.values():
-            group_rotation, group_translation = motion[:, :3, :3], motion[:, :3, 3]
-            moved_rotation = rotation @ group_rotation
-            shift = rotated(group_rotation, np.broadcast_to(origin, (count, 3))) + group_translation - origin
-            moved = translation + rotated(rotation, shift)
-            moved_eye = rotated(-np.swapaxes(moved_rotation, 1, 2), moved)
-            rotations.append(moved_rotation)
-            translations.append(moved)
-            eyes.append(moved_eye - FAR_EYE * moved_rotation[:, 2] if view.parallel else moved_eye)
+            moved = moved_pose(rotation, translation, motion, origin, view.parallel)
+            for stack, array in zip((rotations, translations, eyes), moved, strict=True):
+                stack.append(array)
         arrays = np.stack(rotations), np.stack(translations), np.stack(eyes)
         return ViewBatch(view, *arrays, batch_indices=batch_indices, total=total)
 

@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
-from fidsplat.backends.view import FAR_EYE, SubFrame, View, rotated
+from fidsplat.backends.view import SubFrame, View, moved_pose
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import CaptureBatch
 from fidsplat.effects import FeatureSet, select
@@ -75,8 +75,12 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
     def at(time: float) -> View:
         moved = None if camera is None else motion.moved(camera, time)
         view = View.of(capture, origin, moved)
-        groups = tuple((k, _moved(view, m, origin)) for k, m in motion.groups_at(time))
-        return replace(view, groups=groups) if groups else view
+        groups = []
+        for label, matrix in motion.groups_at(time):
+            pose = moved_pose(view.rotation, view.translation, matrix, origin, view.parallel)
+            rotation, translation, eye = pose
+            groups.append((label, replace(view, rotation=rotation, translation=translation, eye=eye)))
+        return replace(view, groups=tuple(groups)) if groups else view
 
     full_view = at(shutter.time)
     if not capture.has_sub_frames:
@@ -88,18 +92,3 @@ def view_of(capture: Capture, origin: np.ndarray) -> View:
             view = at(time).rows(top * samples, end * samples)
             sub_frames.append(SubFrame(view, top * samples, 1 / len(times), k == 0, k == len(times) // 2))
     return replace(full_view, sub_frames=tuple(sub_frames))
-
-
-def _moved(view: View, motion: np.ndarray, origin: np.ndarray) -> View:
-    """The view for splats that are moved by a rigid motion (4, 4) in world coordinates."""
-    group_rotation, group_translation = motion[:3, :3], motion[:3, 3]
-    rotation = view.rotation @ group_rotation
-    shift = rotated(group_rotation, origin) + group_translation - origin
-    translation = view.translation + rotated(view.rotation, shift)
-    eye = rotated(-rotation.T, translation)
-    return replace(
-        view,
-        rotation=rotation,
-        translation=translation,
-        eye=eye - FAR_EYE * rotation[2] if view.parallel else eye,
-    )

@@ -30,6 +30,20 @@ def rotated(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return (matrices * vectors[..., None, :]).sum(axis=-1) + 0.0
 
 
+def moved_pose(
+    rotation: np.ndarray, translation: np.ndarray, motion: np.ndarray, origin: np.ndarray, parallel: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation, translation and eye of `View` for splats that are moved by rigid motions (..., 4, 4) in world
+    coordinates. rotation, translation: those of unmoved splats, (..., 3, 3) and (..., 3)."""
+    group_rotation, group_translation = motion[..., :3, :3], motion[..., :3, 3]
+    moved_rotation = rotation @ group_rotation
+    origins = np.broadcast_to(origin, group_translation.shape)
+    shift = rotated(group_rotation, origins) + group_translation - origin
+    moved = translation + rotated(rotation, shift)
+    eye = rotated(-np.swapaxes(moved_rotation, -1, -2), moved)
+    return moved_rotation, moved, eye - FAR_EYE * moved_rotation[..., 2, :] if parallel else eye
+
+
 @dataclass(frozen=True)
 class View:
     """The uniforms of a frame, in float64. The sample grid is the image with `samples` x `samples` samples

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
-from fidsplat.backends.interface import HostImages, Images, Pipeline
+from fidsplat.backends.interface import HostImages, Images, Pipeline, summed
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.views import CaptureBatch
 from fidsplat.render.array_export import ImageMapping, SceneIndices, check_process, with_scene_indices
@@ -183,29 +184,18 @@ def stack_bands(bands: Iterable[BandData], pipeline: Pipeline, capture: Capture)
     timings: dict[str, float] = {}
     stats: dict[str, int] = {}
     previous: tuple[Frame, tuple[int, int]] | None = None
-
-    def finish(frame: Frame) -> None:
-        frame.wait()
-        for stage, ms in frame.timings.items():
-            timings[stage] = timings.get(stage, 0.0) + ms
-        for name, count in frame.stats.items():
-            stats[name] = stats.get(name, 0) + count
-
-    def copy_rows(frame: Frame, rows: tuple[int, int]) -> None:
-        for name in frame.outputs:
-            arrays[name] = frame.read_rows(name, *rows, arrays.get(name))
-
-    for band in bands:
+    for band in chain(bands, (None,)):  # None: after the last band
         if previous is not None:
-            finish(previous[0])
-        images = band.images or pipeline.render_view(band.data, band.view)
-        frame = Frame(images, capture, band.scene_indices)
+            if band is None and not arrays:
+                return previous[0]
+            previous[0].wait()
+            timings, stats = summed([timings, previous[0].timings]), summed([stats, previous[0].stats])
+        current = None
+        if band is not None:
+            images = band.images or pipeline.render_view(band.data, band.view)
+            current = Frame(images, capture, band.scene_indices), band.rows
         if previous is not None:
-            copy_rows(*previous)
-        previous = frame, band.rows
-    assert previous is not None  # there is at least one band
-    if not arrays:
-        return previous[0]
-    finish(previous[0])
-    copy_rows(*previous)
+            for name in capture.outputs:
+                arrays[name] = previous[0].read_rows(name, *previous[1], arrays.get(name))
+        previous = current
     return _host_frame(arrays, timings, stats, capture)

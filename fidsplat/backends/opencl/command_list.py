@@ -17,7 +17,7 @@ _UNKNOWN = object()
 class Command:
     """One kernel launch: its own kernel object with bound arguments, and its size."""
 
-    __slots__ = ("_bound", "_types", "group", "kernel", "name", "size", "stage")
+    __slots__ = ("_bound", "_types", "kernel", "local_size", "name", "size", "stage")
 
     def __init__(self, kernel: cl.Kernel, name: str, types: Sequence[Callable[[Any], Any] | None]) -> None:
         """types: the NumPy type of each argument; None for a buffer."""
@@ -25,7 +25,7 @@ class Command:
         self._bound: list[object] = [_UNKNOWN] * len(types)
         self.stage = ""
         self.size: tuple[int, ...] = ()
-        self.group: tuple[int, ...] = ()
+        self.local_size: tuple[int, ...] = ()
 
     def bind(self, index: int, value: Any) -> None:
         """Set an argument unless it already has this value: comparing is faster than setting."""
@@ -76,7 +76,7 @@ class CommandList:
         self,
         kernel: str,
         size: tuple[int, ...],
-        group: tuple[int, ...],
+        local_size: tuple[int, ...],
         values: Sequence[Any],
         stage: str = "",
     ) -> Command:
@@ -87,7 +87,7 @@ class CommandList:
             kernel_object = cl.Kernel(self.program.programs[kernel], kernel)
             commands.append(Command(kernel_object, kernel, self.program.types[kernel]))
         command = commands[number]
-        command.stage, command.size, command.group = stage, size, group
+        command.stage, command.size, command.local_size = stage, size, local_size
         for index, value in enumerate(values):
             command.bind(index, value)
         self._launch_counts[kernel] = number + 1
@@ -100,12 +100,12 @@ class CommandList:
         queue: cl.CommandQueue,
         kernel: str,
         size: tuple[int, ...],
-        group: tuple[int, ...],
+        local_size: tuple[int, ...],
         values: Sequence[Any],
         stage: str = "",
     ) -> cl.Event:
-        command = self.record(kernel, size, group, values, stage)
-        return cl.enqueue_nd_range_kernel(queue, command.kernel, size, group)
+        command = self.record(kernel, size, local_size, values, stage)
+        return cl.enqueue_nd_range_kernel(queue, command.kernel, size, local_size)
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Change arguments by name, in all commands that have one of that name."""
@@ -119,7 +119,7 @@ class CommandList:
     def submit(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
         """Enqueue the commands [first, end) in order; by default all."""
         return [
-            cl.enqueue_nd_range_kernel(queue, command.kernel, command.size, command.group)
+            cl.enqueue_nd_range_kernel(queue, command.kernel, command.size, command.local_size)
             for command in self._commands[first:end]
         ]
 

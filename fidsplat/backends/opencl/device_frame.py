@@ -100,7 +100,7 @@ class DeviceFrame:
         commands: CommandList,
         config: KernelConfig,
         resident: Resident,
-        views: ViewBatch,
+        batch: ViewBatch,
         plan: MemoryPlan,
         replay_queue: cl.CommandQueue | None = None,
         pair_limit: int = 0,
@@ -112,8 +112,8 @@ class DeviceFrame:
         self.resident, self.plan = resident, plan
         self.records_per_view = resident.count
         """records per view: the number of splats, or with `culls_first` the capacity for unculled splats"""
-        self.batch, self.views = views, len(views)
-        self.view = view = views.view
+        self.batch, self.view_count = batch, len(batch)
+        self.view = view = batch.view
         self.waits = replay_queue is None or config.binning == "sort_first"
         """whether the host waits for the counts"""
         self.pair_limit, self.pool = pair_limit, workspace.pool
@@ -123,13 +123,13 @@ class DeviceFrame:
         workspace.frames += 1
         self.tiles_x = -(-view.width // config.tile_width)
         self.tiles_y = -(-view.height // config.tile_height)
-        self.tiles = self.views * self.tiles_x * self.tiles_y
+        self.tiles = self.view_count * self.tiles_x * self.tiles_y
         """number of tiles of all views; the tiles of a view are consecutive"""
         self.stride = self.tiles_x * config.tile_width
         self.rows = self.tiles_y * config.tile_height
         self.first_tile, self.end_tile = 0, self.tiles
         """tiles of the requested rows"""
-        if view.sample_rows is not None and config.binning == "sort_first" and self.views == 1:
+        if view.sample_rows is not None and config.binning == "sort_first" and self.view_count == 1:
             self.first_tile = view.sample_rows[0] // config.tile_height * self.tiles_x
             self.end_tile = -(-view.sample_rows[1] // config.tile_height) * self.tiles_x
         self.buffers = FrameBuffers()
@@ -138,7 +138,7 @@ class DeviceFrame:
         self.scalars: dict[str, Any] = scalar_arguments(view, self.source)
         """scalar kernel arguments by name"""
         self.scalars |= {"width": view.width, "height": view.height, "stride": self.stride}
-        self.scalars["channel_stride"] = self.views * self.rows * self.stride
+        self.scalars["channel_stride"] = self.view_count * self.rows * self.stride
         self.sample_buffers = RAW, *self.source.sample_buffers
         """sample buffers, which the blend stage writes"""
         self.is_sub_frame = False
@@ -165,8 +165,8 @@ class DeviceFrame:
 
     def sub_frame(self, view: View) -> DeviceFrame:
         """The frame of `view`, one of the camera poses that a shutter averages."""
-        views = ViewBatch.single(view)
-        frame = DeviceFrame(self.workspace, self.commands, self.config, self.resident, views, self.plan)
+        batch = ViewBatch.single(view)
+        frame = DeviceFrame(self.workspace, self.commands, self.config, self.resident, batch, self.plan)
         frame.is_sub_frame = True
         return frame
 
@@ -191,20 +191,20 @@ class DeviceFrame:
         stage: str,
         kernel: str,
         items: tuple[int, ...],
-        group: tuple[int, ...],
-        views: int = 1,
+        local_size: tuple[int, ...],
+        view_count: int = 1,
         **arguments: Any,
     ) -> cl.Event:
         """Submit a kernel with at least `items` work-items per view. arguments: values by name,
         for arguments that the frame does not define."""
-        size = tuple([-(-count // side) * side for count, side in zip(items, group, strict=True)])
-        if views > 1:
-            size, group = (*size, views), (*group, 1)
+        size = tuple([-(-count // side) * side for count, side in zip(items, local_size, strict=True)])
+        if view_count > 1:
+            size, local_size = (*size, view_count), (*local_size, 1)
         values = [
             arguments[name] if name in arguments else self.argument_value(declared)
             for name, declared in self.source.arguments[kernel].items()
         ]
-        event = self.commands.launch(self.queue, kernel, size, group, values, stage)
+        event = self.commands.launch(self.queue, kernel, size, local_size, values, stage)
         self.events.append(event)
         self.stages.append(stage)
         return event
@@ -215,13 +215,14 @@ class DeviceFrame:
         self.events, self.stages = [], []
 
     def argument_value(self, argument: Argument) -> Any:
+        """A buffer or number of the frame; an array of the view is uploaded."""
         name = argument.name
         for values in (self.named, self.scalars):
             if name in values:
                 return values[name]
         if argument.source == "uniform":  # of the backward pass; others are in `scalars`
-            group, index = argument.uniform
-            return self.view.uniforms_of(group)[index]
+            uniform_group, index = argument.uniform
+            return self.view.uniforms_of(uniform_group)[index]
         return self.upload(name, self.view.array(name))
 
     def scratch(self, name: str, size: int) -> cl.Buffer:

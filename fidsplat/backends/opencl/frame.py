@@ -57,7 +57,7 @@ def render_sort_first(frame: DeviceFrame) -> None:
     count, big = frame.resident.count, 0
     frame.upload_view(0, frame.rows)
     while True:
-        tiling.allocate_counters(frame, COUNTERS * frame.views, big)
+        tiling.allocate_counters(frame, COUNTERS * frame.view_count, big)
         tiling.project(frame, 0, count)
         tiling.sort_by_depth(frame, count)
         counts = tiling.count_pairs(frame, count)
@@ -165,7 +165,9 @@ def _launch_grid(
     frame: DeviceFrame, stage: str, kernel: str, width: int, height: int, **arguments: Any
 ) -> None:
     """Submit a kernel with a work-item for each pixel or sample of each view."""
-    frame.launch(stage, kernel, (width, height), _GRID, frame.views, width=width, height=height, **arguments)
+    frame.launch(
+        stage, kernel, (width, height), _GRID, frame.view_count, width=width, height=height, **arguments
+    )
 
 
 def render_sub_frames(frame: DeviceFrame) -> None:
@@ -173,7 +175,6 @@ def render_sub_frames(frame: DeviceFrame) -> None:
     for samples in frame.sample_buffers:
         size = 4 * frame.rows * frame.stride * samples.channels
         frame.named[samples.name] = frame.pool.scratch(f"accumulated {samples.name}", size)
-    frame.upload("batch_indices", frame.batch.batch_indices)
     background_arrays = {
         name: frame.upload(name, frame.view.array(name))
         for name, argument in frame.source.arguments.get("composite_background", {}).items()
@@ -193,6 +194,7 @@ def render_sub_frames(frame: DeviceFrame) -> None:
         frame.pool.release(blended.acquired.items())
     if "rays" in frame.source.arguments.get("resolve", {}):
         frame.bind_rays()
+    frame.upload("batch_indices", frame.batch.batch_indices)  # sub-frames have overwritten this buffer
     resolve(frame)
     frame.stats = partial(dict, stats)
 

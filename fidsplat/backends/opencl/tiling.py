@@ -102,13 +102,13 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
             arrays = {name: resident.array_in_cloud_order(name, first, end) for name in names}
         batch = frame.config.splats_per_item
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
-        frame.launch("project", "project", (items,), (group,), frame.views, count=count, **arrays)
+        frame.launch("project", "project", (items,), (group,), frame.view_count, count=count, **arrays)
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
     """Number of elements of a buffer with one per splat and view; for a complete cloud it is rounded up."""
     resident = frame.resident
-    return frame.views * (resident.capacity if count == resident.count else count)
+    return frame.view_count * (resident.capacity if count == resident.count else count)
 
 
 # on CPUs: sort by depth, then append to tile lists
@@ -116,7 +116,7 @@ def _splat_capacity(frame: DeviceFrame, count: int) -> int:
 
 def sort_by_depth(frame: DeviceFrame, count: int) -> None:
     """Radix sort of the visible splats by depth, ties by index."""
-    views, blocks, bins = frame.views, frame.config.sort_blocks, 1 << frame.config.radix_bits
+    views, blocks, bins = frame.view_count, frame.config.sort_blocks, 1 << frame.config.radix_bits
     table = frame.scratch("sort table", 4 * bins * blocks * views)
     size = 4 * _splat_capacity(frame, count)
     keys, order = frame.buffers.keys, frame.scratch("order 0", size)
@@ -134,7 +134,7 @@ def sort_by_depth(frame: DeviceFrame, count: int) -> None:
 
 def count_pairs(frame: DeviceFrame, count: int) -> Counts:
     """Count the length of each tile's list; waits for the totals."""
-    views = frame.views
+    views = frame.view_count
     table = frame.scratch("bin table", 4 * frame.tiles * frame.config.sort_blocks)
     frame.launch("bin", "bin_count", (frame.config.sort_blocks,), (1,), views, table=table, count=count)
     # tiles of all views are numbered consecutively, view after view
@@ -167,7 +167,9 @@ def fill_sorted_lists(frame: DeviceFrame, tile_range: TileRange, count: int) -> 
     frame.scratch("lists", 4 * size)
     arguments = {"first_tile": tile_range.first, "end_tile": tile_range.end, "count": count}
     table = frame.named["bin table"]
-    frame.launch("bin", "bin_emit", (frame.config.sort_blocks,), (1,), frame.views, table=table, **arguments)
+    frame.launch(
+        "bin", "bin_emit", (frame.config.sort_blocks,), (1,), frame.view_count, table=table, **arguments
+    )
 
 
 def _prefix_sums(
@@ -175,7 +177,7 @@ def _prefix_sums(
 ) -> cl.Buffer:
     """Prefix sums over tables of counts: the start of each bin (lists, bins of a list + 1). lists: 1 for a
     single list of all views, or the number of views. counter: index of the sum in the buffer `counters`."""
-    views, items = frame.views, frame.config.scan_items
+    views, items = frame.view_count, frame.config.scan_items
     totals = frame.scratch(f"{stage} totals", 4 * bins * views)
     list_bins = bins * views // lists
     starts = frame.scratch(f"{stage} starts", 4 * (list_bins + 1) * lists)
@@ -298,7 +300,7 @@ def fill_and_sort_lists(
     # with `culls_first` the lists reuse the buffer of the windows, which no kernel reads after `emit`
     reuses = frame.config.culls_first and not frame.in_tile_ranges
     frame.buffers.lists = frame.pool.scratch("windows" if reuses else "lists", 4 * capacity)
-    count, views, work_groups = frame.records_per_view, frame.views, _big_groups(frame)
+    count, views, work_groups = frame.records_per_view, frame.view_count, _big_groups(frame)
     arguments = {
         "first_tile": tile_range.first,
         "end_tile": tile_range.end,
@@ -327,7 +329,9 @@ def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:
     count, items = frame.resident.count, frame.config.scan_items
     if count:
         work_groups = -(-count // _WORK_GROUP_SPLATS)
-        frame.launch("bin", kernel, (work_groups * items,), (items,), frame.views, count=count, **arguments)
+        frame.launch(
+            "bin", kernel, (work_groups * items,), (items,), frame.view_count, count=count, **arguments
+        )
 
 
 def _big_groups(frame: DeviceFrame) -> int:
