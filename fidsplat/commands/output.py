@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from fidsplat.experiments.sweep import Key, Record, Sweep
 
 T = TypeVar("T")
+_MAX_WIDTH = 10_000
+"""maximum width of a table in a file or pipe, characters"""
 Table = tuple[str, Sequence[str], Iterable[Sequence[object]]]
 """title, column heads and rows, the arguments of `print_table`"""
 
@@ -56,7 +58,7 @@ def print_lines(where: Console, *lines: str) -> None:
 
 
 def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table under its title; cells are plain text and wrap."""
+    """Print a table under its title; cells are plain text, and wrap in a terminal only."""
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -72,6 +74,9 @@ def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable
         table.add_column(Text(head), overflow="fold")
     for row in rows:
         table.add_row(*(Text(str(cell)) for cell in row))
+    if not where.is_terminal:
+        natural = where.measure(table, options=where.options.update(max_width=_MAX_WIDTH)).maximum
+        where.width = max(where.width, natural)
     where.print(table)
 
 
@@ -121,7 +126,11 @@ def delayed_progress(after: float = 1.0) -> Iterator[Callable[[str, float], None
 
 
 def show_progress(
-    name: str, steps: Iterable[T], total: int, done: int = 0, label: Callable[[T], str] = lambda step: ""
+    name: str,
+    steps: Iterable[T],
+    total: int | None,
+    done: int = 0,
+    label: Callable[[T], str] = lambda step: "",
 ) -> Iterator[T]:
     """Yield each finished step; a progress bar on stderr counts the steps and shows the last one's label."""
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn

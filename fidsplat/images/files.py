@@ -88,7 +88,7 @@ def read_images(
     """
     file = path_of(path)
     if file.is_dir():
-        names = sorted(name for name in file.iterdir() if name.suffix.lower() in IMAGE_SUFFIXES)
+        names = _image_files(file)
         if not names:
             raise InputError(
                 f"{file} must contain an image file, got none; known suffixes are {', '.join(IMAGE_SUFFIXES)}"
@@ -106,6 +106,17 @@ def read_images(
         yield from _frames(file)
     else:
         yield str(path), read_image(file)
+
+
+def count_images(path: str | os.PathLike[str]) -> int | None:
+    """Number of files that `read_images` reads from a path; None for a video."""
+    file = path_of(path)
+    return len(_image_files(file)) if file.is_dir() else None if is_video(file) else 1
+
+
+def _image_files(folder: Path) -> list[Path]:
+    """Image files of a folder, sorted by name."""
+    return sorted(name for name in folder.iterdir() if name.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _frames(file: Path) -> Iterator[tuple[str, np.ndarray]]:

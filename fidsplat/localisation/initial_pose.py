@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -69,6 +70,13 @@ def pose_of_markers(image: np.ndarray, scene: Scene, camera: Camera) -> Detected
     if not np.isfinite(pose).all():
         return None
     return DetectedMarkers(camera.with_pose(pose), [code.name for code, _ in pairs], points, corners)
+
+
+def repeated_markers(scene: Scene) -> list[str]:
+    """Contents of markers that occur more than once in a scene, and do not determine a pose."""
+    markers = [placed.marker for placed in scene.markers if placed.marker.kind not in BOARDS]
+    counts = Counter(map(content_of, markers))
+    return list(dict.fromkeys(marker.spec for marker in markers if counts[content_of(marker)] > 1))
 
 
 def most_similar(

@@ -15,7 +15,7 @@ from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import pixels_of
 from fidsplat.localisation.direct_alignment import MAX_SIDE, MIN_INLIERS, MIN_SIDE, align
-from fidsplat.localisation.initial_pose import most_similar, pose_of_markers
+from fidsplat.localisation.initial_pose import most_similar, pose_of_markers, repeated_markers
 from fidsplat.localisation.normal_equations import Source
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
@@ -178,9 +178,11 @@ def localise(
         starts, source = [detected.camera], ", ".join(detected.names)
     if not starts:
         if not len(candidates):
+            repeated = repeated_markers(scene) if isinstance(scene, Scene) else []
+            unused = f" ({', '.join(repeated)} more than once)" if repeated else ""
             raise InputError(
                 "localisation must have an initial pose, got no start, no marker in the image that occurs "
-                "once in the scene and no candidates; give start= or candidates="
+                f"once in the scene{unused} and no candidates; give start= or candidates="
             )
         source = "candidates"
 

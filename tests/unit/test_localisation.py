@@ -3,7 +3,9 @@
 import gc
 import json
 import math
+import os
 import runpy
+import signal
 import weakref
 from dataclasses import replace
 from functools import partial
@@ -356,8 +358,41 @@ def test_a_tag_gives_the_initial_pose(renderer, tmp_path, capsys):
     assert written.poses[0] == pytest.approx(scene.camera.camera_to_world, abs=5e-3)
     assert written.times[0] == 1  # "blank" is the first of the folder
     assert [Path(each["image"]).stem for each in images] == ["blank", "photo", "torn", "turned"]
-    assert main([*words, "-o", str(tmp_path / "poses.kitti")]) == 0
-    assert "only the found poses" in " ".join(capsys.readouterr().out.split())
+    assert main([*words, "-o", str(tmp_path / "poses.kitti")]) == 2
+    assert "whose lines have no number, got 1 of 4; write .tum" in capsys.readouterr().err
+    assert not (tmp_path / "poses.kitti").exists()
+    away = ["--start", "3.1,-2.05,4.7,0,1,0,0", "-o", str(tmp_path / "photo.kitti")]
+    assert main(["localise", str(tmp_path / "photo.png"), *words[2:], *away]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if str(tmp_path / "photo.png") in line)
+    assert row.split()[1] == "yes"
+    assert row.split()[-1] == marker.spec  # the table of a pipe does not wrap
+
+
+def test_an_interrupted_command_writes_its_poses(renderer, tmp_path, monkeypatch, capsys):
+    pose = np.eye(4)
+    pose[:3, 3] = 3.0, -2.0, 5.75
+    scene = scene_with(count=40, marker=fs.scenes.PlacedMarker(fs.marker("apriltag:36h11:5", size=0.5), pose))
+    scene.save(tmp_path / "scene.toml")
+    image, names = renderer.render(scene)["rgb"], [str(tmp_path / f"{k}.png") for k in range(3)]
+    for name in names:
+        write_png(name, image)
+    calls, localise = [], fs.localise
+
+    def interrupted(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return localise(*arguments, **options)
+
+    monkeypatch.setattr(fs, "localise", interrupted)
+    words = ["--scene", str(tmp_path / "scene.toml"), "--device", "opencl", "-o", str(tmp_path / "poses.tum")]
+    assert main(["localise", *names, *words, "--json"]) == 130
+    printed = capsys.readouterr()
+    assert [each["image"] for each in json.loads(printed.out)["images"]] == names[:1]
+    assert printed.err.endswith("interrupted\n")
+    written = fs.load_trajectory(tmp_path / "poses.tum")
+    assert written.poses[0] == pytest.approx(scene.camera.camera_to_world, abs=5e-3)
+    assert len(calls) == 2
 
 
 def test_the_most_similar_candidate_is_the_start(renderer, room):
@@ -410,6 +445,9 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
         fs.localise(image, scene, scene.camera, renderer=renderer, resident=scene)
     scene.save(tmp_path / "scene.toml")
     write_png(tmp_path / "photo.png", image)
+    marker = fs.scenes.PlacedMarker(fs.marker("apriltag:36h11:5", size=0.5), np.eye(4))
+    with pytest.raises(fs.InputError, match=r"once in the scene \(apriltag:36h11:5 more than once\)"):
+        fs.localise(image, replace(scene, markers=[marker, marker]), renderer=renderer, resident=resident)
     words = ["localise", str(tmp_path / "photo.png"), "--scene", str(tmp_path / "scene.toml")]
     assert main([*words, "--start", "1,2,3"]) == 2
     assert "--start must be 7 numbers X,Y,Z,QW,QX,QY,QZ" in capsys.readouterr().err
@@ -423,7 +461,7 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
     words += ["--start", "3.1,-2.05,4.7,0,1,0,0", "-o", str(file)]  # away from the scene
     assert main(words) == 2
     printed = capsys.readouterr()
-    assert "Poses in" in printed.out
+    assert "photo.png: the image must determine the pose" in printed.out
     assert "a pose must be found to write" in printed.err
     file.write_text("mine")
     assert main(words) == 2
