@@ -107,7 +107,7 @@ def _tile_spans(
 
 
 def _extent(view: View, features: FeatureSet) -> Extent | None:
-    """Extent within which splats contribute or have their own depth."""
+    """Extent within which splats contribute, and at least that within which their depths vary."""
     return Extent.of(view, features, _DEPTH_RANGE * PADDING)
 
 

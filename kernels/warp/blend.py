@@ -17,7 +17,7 @@ from .pixel import make_pixel
 from .rays import RAY_DERIVATIVES
 from .records import RecordLayout
 from .splat import make_splat
-from .staging import STAGED, alone, make_staging
+from .staging import STAGED, is_single_thread, make_staging
 
 _PLAIN = frozenset({"lowpass_screen", "stop_exclusive", "arithmetic_fast", "ellipsoids_only"})
 _CELL = CELL_W * CELL_H
@@ -229,7 +229,7 @@ def make_blend(
                 for n in range(count):
                     which = cell_splat(shared, cell, n)
                     s = load(shared, records, lists, k, which, view)
-                    if alone():
+                    if is_single_thread():
                         box = box_of(shared, records, lists, k, which)
                         cells = overlapping_cells(s, box, left, top, cell / 32, view)
                         if (cells >> wp.uint32(cell % 32) & _ONE) == _NONE:

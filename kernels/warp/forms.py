@@ -51,7 +51,7 @@ def make_forms(effects: tuple[str, ...], outputs: tuple[str, ...], real):
     def forms(
         a: vec3,  # scaled tangents
         b: vec3,
-        unit_normal: vec3,  # unit normal
+        unit_normal: vec3,
         offset: real,  # distance of the plane from the camera's centre, along the normal
         p: vec3,
         su: real,  # su sv: area of the tangents

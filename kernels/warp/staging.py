@@ -106,7 +106,7 @@ _STAGED_VEC4 = """
     return records.data[lists.data[first + which] * VEC4S + at];
 #endif
 """
-_ALONE = """
+_IS_SINGLE_THREAD = """
 #if defined(__CUDA_ARCH__)
     return false;
 #else
@@ -115,8 +115,8 @@ _ALONE = """
 """
 
 
-@wp.func_native(_ALONE)
-def alone() -> bool:
+@wp.func_native(_IS_SINGLE_THREAD)
+def is_single_thread() -> bool:
     """Whether a block is a single thread, which processes all cells."""
     ...
 
