@@ -56,7 +56,7 @@ class Rates:
     """float32 divisions, as in the blend stage"""
 
 
-class ResidentData(ABC):
+class DeviceCloud(ABC):
     """A cloud on a device, with the properties that select its kernels (splats/properties.py)."""
 
     count: int
@@ -228,30 +228,30 @@ class Pipeline(ABC):
     """The stages compiled for one FeatureSet."""
 
     @abstractmethod
-    def render_view(self, resident: Any, view: View) -> Images:
+    def render_view(self, cloud: Any, view: View) -> Images:
         """Render one view of an uploaded cloud."""
 
-    def render(self, resident: Any, views: ViewBatch) -> Images:
+    def render(self, cloud: Any, views: ViewBatch) -> Images:
         """Render several views, each bit-identical to rendering it alone. By default one after another."""
         images = {
-            index: self.render_view(resident, views.view_at(number))
+            index: self.render_view(cloud, views.view_at(number))
             for number, index in enumerate(views.batch_indices.tolist())
         }
-        return SeparateImages(images, views, resident.count)
+        return SeparateImages(images, views, cloud.count)
 
     def render_subsampled(
-        self, resident: Any, view: View, step: int, progress: Callable[[float], object] | None = None
+        self, cloud: Any, view: View, step: int, progress: Callable[[float], object] | None = None
     ) -> Images:
         """Render every step-th pixel in both directions, from the first: (ceil(h / step), ceil(w / step))
         images, bit-identical to those pixels of a complete frame. progress: called with the completed
         fraction, 0 to 1."""
         raise NotImplementedError
 
-    def fits(self, resident: Any, view: View) -> bool:
+    def fits(self, cloud: Any, view: View) -> bool:
         """Whether the frame fits the memory budget without projecting the cloud in slices."""
         return True
 
-    def render_intermediates(self, resident: Any, view: View) -> dict[str, np.ndarray]:
+    def render_intermediates(self, cloud: Any, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the buffers between the stages, for tests. Empty by default."""
         return {}
 
@@ -260,7 +260,7 @@ class GradientPipeline(ABC):
     """The stages and their gradients, compiled for one FeatureSet."""
 
     @abstractmethod
-    def forward(self, resident: Any, view: View, waits: bool = True) -> Any:
+    def forward(self, cloud: Any, view: View, waits: bool = True) -> Any:
         """Render one view of an uploaded cloud, bit-identical to `Pipeline.render`, for a later `backward`.
 
         waits: whether to wait until the number of (splat, tile) pairs shows that the buffers were large
@@ -323,7 +323,7 @@ class Backend(ABC):
         return f"device must {requirement}, got {self.info.name}; {remedy}"
 
     @abstractmethod
-    def upload(self, cloud: SplatCloud) -> ResidentData:
+    def upload(self, cloud: SplatCloud) -> DeviceCloud:
         """Copy a cloud to the device."""
 
     @abstractmethod
@@ -345,7 +345,7 @@ class Backend(ABC):
             self.unsupported_message("have a memory budget", f"leave out memory_budget={budget}")
         )
 
-    def wrap_arrays(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
+    def wrap_arrays(self, arrays: Mapping[str, Any], origin: np.ndarray) -> DeviceCloud:
         """Use arrays that are already on the device (`means`, `quats`, ...) as a cloud, without a copy."""
         raise InputError(self.unsupported_message("wrap arrays", "use a Warp device, or a SplatCloud"))
 

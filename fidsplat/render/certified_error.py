@@ -45,7 +45,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, Images, ResidentData
+from fidsplat.backends.interface import Backend, DeviceCloud, Images
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
@@ -157,7 +157,7 @@ def error_reference(data: Any, capture: Capture, backend: Backend) -> ErrorRefer
     """Prepare the reference image of an uploaded cloud: its features, view and error bound. Raises
     InputError for an effect without a bound, a store, or a device without float64."""
     _refuse_unbounded(capture)
-    if not isinstance(data, ResidentData):
+    if not isinstance(data, DeviceCloud):
         raise InputError(
             "splats must be in memory for the output 'error', got a store (a scene in chunks on disk); "
             "render store.cloud() if it fits into memory, or leave out the output 'error'"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, ResidentData
+from fidsplat.backends.interface import Backend, DeviceCloud
 from fidsplat.backends.view import View
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.quality import Quality
@@ -25,7 +25,7 @@ class ResidentCloud:
     def __init__(
         self,
         backend: Backend,
-        data: ResidentData | DeviceChunkCache,
+        data: DeviceCloud | DeviceChunkCache,
         capture: Capture,
         labels: np.ndarray | None = None,
     ) -> None:

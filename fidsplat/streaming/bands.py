@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fidsplat.backends.interface import Images, ResidentData
+from fidsplat.backends.interface import DeviceCloud, Images
 from fidsplat.backends.ranges import split_by_cost
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
@@ -35,7 +35,7 @@ class BandData:
     rows: tuple[int, int]
     """pixels [first, end)"""
     view: View
-    data: ResidentData | None
+    data: DeviceCloud | None
     scene_indices: Callable[[], np.ndarray]
     """function that returns the indices in the scene of its splats, (n,) int32"""
     images: Images | None = None

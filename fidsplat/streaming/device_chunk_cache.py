@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, Images, Pipeline, ResidentData
+from fidsplat.backends.interface import Backend, DeviceCloud, Images, Pipeline
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.termination_depth import TerminationDepths
 from fidsplat.backends.view import View
@@ -52,7 +52,7 @@ class DeviceChunkCache:
     def __init__(self, scene: ChunkedSplats, backend: Backend) -> None:
         self.scene, self._backend, self.chunks = scene, backend, DeviceChunks(scene)
         self._cache = backend.chunk_cache(self.chunks) if backend.has("chunk_cache") else None
-        self._current: tuple[Selection, int, ResidentData] | None = None
+        self._current: tuple[Selection, int, DeviceCloud] | None = None
         self._splitter, self._occlusion = BandSplitter(), OcclusionCulling()
         self._prefetch_thread: threading.Thread | None = None
         self.node_count = 0
@@ -103,7 +103,7 @@ class DeviceChunkCache:
 
     def gather(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
-    ) -> tuple[ResidentData, Callable[[], np.ndarray]]:
+    ) -> tuple[DeviceCloud, Callable[[], np.ndarray]]:
         """Load the splats that are visible in any of several views. The lowest `detail_error` applies to all.
 
         Returns the splats, and a function that returns their scene indices (n,) int32.
@@ -112,7 +112,7 @@ class DeviceChunkCache:
         self.node_count = len(selection)
         return self._loaded(selection), partial(self.scene.ids, selection)
 
-    def _loaded(self, selection: Selection, first_id: int = 0) -> ResidentData:
+    def _loaded(self, selection: Selection, first_id: int = 0) -> DeviceCloud:
         if self._current is None or self._current[:2] != (selection, first_id):
             self._current = None  # released before the upload, as both may not fit on the device
             if self._cache is None:

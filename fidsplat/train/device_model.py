@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.interface import Images, ResidentData
+from fidsplat.backends.interface import DeviceCloud, Images
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
@@ -81,7 +81,7 @@ class DeviceModel:
     def __len__(self) -> int:
         return self._number
 
-    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+    def resident(self, degree: int, origin: np.ndarray) -> DeviceCloud:
         """The splats as a cloud to render, with SH of this degree."""
         return self._kernels.resident(degree, origin)
 

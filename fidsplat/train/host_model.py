@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.gradients import on_host
-from fidsplat.backends.interface import Backend, Images, ResidentData
+from fidsplat.backends.interface import Backend, DeviceCloud, Images
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
@@ -63,7 +63,7 @@ class HostModel:
     def __len__(self) -> int:
         return len(self._splats)
 
-    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+    def resident(self, degree: int, origin: np.ndarray) -> DeviceCloud:
         """The splats as a cloud to render, with SH of this degree."""
         return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.gradients import on_host
+from fidsplat.backends.warp.cloud import split_scales
 from fidsplat.backends.warp.device import WarpBackend
 from fidsplat.backends.warp.gradients import add_to
-from fidsplat.backends.warp.resident import split_scales
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.pose_offset import offset_camera, offset_gradient
 from fidsplat.capture.capture import Capture

@@ -44,7 +44,7 @@ def marked(frame):
         left, top = tile % view.tiles_x * view.tile_w, tile / view.tiles_x * view.tile_h
         found[k, tile] = cells(s, box, left, top, 0, view)
 
-    count = frame.resident.count
+    count = frame.cloud.count
     found = wp.zeros((count, frame.tiles), dtype=wp.uint32, device="cpu")
     held, lists = frame.named, wp.array(np.arange(count), dtype=wp.int32, device="cpu")
     wp.launch(ask, found.shape, [held["views"], held["records"], lists, found], device="cpu")

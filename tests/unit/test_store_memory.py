@@ -186,8 +186,8 @@ def test_frames_and_cached_chunks_keep_the_budget(stores, monkeypatch):
         # room is left for all that the cache may come to take, whatever it holds yet
         empty = limited.backend.chunk_cache(resident.data.chunks)
         gathered = empty.gather(resident.data.chunks.of(resident.data.scene.all_chunks(), True))
-        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * gathered.capacity
-        assert len(store) <= gathered.capacity <= 9 / 8 * len(store)
+        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * gathered.padded_count
+        assert len(store) <= gathered.padded_count <= 9 / 8 * len(store)
         assert empty.memory_bytes == 0
         del limited, resident, frame, cache, empty, gathered
         gc.collect()

@@ -26,7 +26,7 @@ def open_device(selector):
     return Backend()
 
 
-class Cloud(interface.ResidentData):
+class Cloud(interface.DeviceCloud):
     memory_bytes = 0
 
     def __init__(self, cloud):

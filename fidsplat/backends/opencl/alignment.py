@@ -140,10 +140,10 @@ class OpenCLAlignment(AlignmentKernels):
     def _replay(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> _Replayed | None:
         """Submit a frame of a stage without waiting. None if it cannot be replayed: on CPUs, in chunks, for
         an empty cloud, with moving groups, a shutter or parallel rays."""
-        camera, (resident, capture) = self._stages[stage].camera, self._scene.key
+        camera, (cloud, capture) = self._stages[stage].camera, self._scene.key
         sizes = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
         key = capture, *sizes, camera.near, camera.far, camera.lens
-        replays = self._replays.setdefault(resident, {})
+        replays = self._replays.setdefault(cloud, {})
         replayed = replays.get(key)
         if replayed is None or not replayed.bind():
             if len(replays) >= _MAX_REPLAYS:
@@ -416,11 +416,11 @@ class _Replayed:
 
     @classmethod
     def of(
-        cls, workspace: Workspace, pipeline: Any, resident: Any, view: View, origin: np.ndarray
+        cls, workspace: Workspace, pipeline: Any, cloud: Any, view: View, origin: np.ndarray
     ) -> _Replayed | None:
         """Frames with the size and effects of a view; None if they cannot be replayed."""
-        plain = not (view.groups or view.sub_frames or view.parallel) and resident.count
-        if pipeline.config.binning == "sort_first" or not plain or not pipeline.fits(resident, view):
+        plain = not (view.groups or view.sub_frames or view.parallel) and cloud.count
+        if pipeline.config.binning == "sort_first" or not plain or not pipeline.fits(cloud, view):
             return None
         pixels = (view.width // view.samples) * (view.height // view.samples)
         scratch = {
@@ -429,7 +429,7 @@ class _Replayed:
             )
             for output in pipeline.outputs.values()
         }
-        frame = pipeline.replay_undivided(resident, view, 0)
+        frame = pipeline.replay_undivided(cloud, view, 0)
         owner = pipeline.images_of(frame)
         replayed = None if frame.recorded is None else cls(workspace, frame, owner, origin, scratch)
         return replayed if replayed is not None and replayed.bind() else None

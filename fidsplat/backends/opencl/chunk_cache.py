@@ -18,9 +18,9 @@ import pyopencl as cl
 
 from fidsplat.backends.interface import Chunk
 from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.backends.opencl.cloud import OpenCLCloud
 from fidsplat.backends.opencl.host_memory import rounded_up
 from fidsplat.backends.opencl.program import build
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 
 _CACHE_DIVISOR = 4
@@ -243,7 +243,7 @@ class OpenCLChunkCache:
         self._size = size
 
 
-class GatheredChunks(Resident):
+class GatheredChunks(OpenCLCloud):
     """A cloud assembled from cached chunks; `streamed` if it exceeds its fraction of the memory budget."""
 
     is_spatially_sorted = True
@@ -255,13 +255,13 @@ class GatheredChunks(Resident):
         self._ends = np.cumsum([chunk.count for chunk in chunks], dtype=np.int64)
         super().__init__(int(self._ends[-1]))
         self.copy_properties(cache.chunks.scene)
-        self.capacity = rounded_up(self.count, 4)  # so that the next view reuses the buffers
+        self.padded_count = rounded_up(self.count, 4)  # so that the next view reuses the buffers
         self._acquired: list[tuple[str, cl.Buffer]] = []
         weakref.finalize(self, workspace.pool.release, self._acquired)
         self._previous_copy: tuple[int, int, CopyParameters | None] = (0, 0, None)
         """the last copy: its splats [first, end), and its parameters"""
         row_bytes = cache.row_bytes.values()
-        total, widest = self.capacity * sum(row_bytes), self.capacity * max(row_bytes)
+        total, widest = self.padded_count * sum(row_bytes), self.padded_count * max(row_bytes)
         self.streamed = (
             total > workspace.memory_budget // _CLOUD_DIVISOR or widest > workspace.device.max_mem_alloc_size
         )
@@ -271,7 +271,11 @@ class GatheredChunks(Resident):
         frame."""
         splat_bytes = sum(self._row_bytes(name) for name in {*names, *self._buffers})
         cache_bytes = self._cache.reserved_bytes
-        return (cache_bytes, splat_bytes) if self.streamed else (cache_bytes + self.capacity * splat_bytes, 0)
+        return (
+            (cache_bytes, splat_bytes)
+            if self.streamed
+            else (cache_bytes + self.padded_count * splat_bytes, 0)
+        )
 
     @property
     def memory_bytes(self) -> int:
@@ -286,7 +290,7 @@ class GatheredChunks(Resident):
         if name not in self._buffers:
             # the buffer of the previous view is reused if large enough: allocating takes as long as filling
             label = f"the splats' {name}"
-            buffer = self._workspace.pool.acquire(label, self.capacity * row_bytes, larger=True)
+            buffer = self._workspace.pool.acquire(label, self.padded_count * row_bytes, larger=True)
             self._acquired.append((label, buffer))
             self._fill(name, 0, self.count, buffer)
             self._cache.wait()  # frames may be rendered on another queue

@@ -14,6 +14,7 @@ from fidsplat.backends.checked_cache import check_once
 from fidsplat.backends.interface import Backend, DeviceInfo, Rates
 from fidsplat.backends.opencl.alignment import OpenCLAlignment
 from fidsplat.backends.opencl.chunk_cache import OpenCLChunkCache
+from fidsplat.backends.opencl.cloud import UploadedCloud
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.kernel_config import (
@@ -28,7 +29,6 @@ from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.pocl_workarounds import is_pocl, kernel_cache, linker, target_patch
 from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.program import BackgroundCompiler, build_options
-from fidsplat.backends.opencl.resident import UploadedCloud
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_registered, processor_flags

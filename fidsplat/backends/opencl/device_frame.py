@@ -11,13 +11,13 @@ import pyopencl as cl
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.buffers import DeviceRecord
+from fidsplat.backends.opencl.cloud import OpenCLCloud
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import Capacity, Counts
 from fidsplat.backends.opencl.declare import Argument
 from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.kernel_interface import RAW
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uniforms import array_arguments, scalar_arguments
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
@@ -99,7 +99,7 @@ class DeviceFrame:
         workspace: Workspace,
         commands: CommandList,
         config: KernelConfig,
-        resident: Resident,
+        cloud: OpenCLCloud,
         batch: ViewBatch,
         plan: MemoryPlan,
         replay_queue: cl.CommandQueue | None = None,
@@ -109,8 +109,8 @@ class DeviceFrame:
         GPU the host does not wait for their counts. pair_limit: largest capacity of the lists of a recorded
         frame; 0: no limit."""
         self.workspace, self.commands, self.config = workspace, commands, config
-        self.resident, self.plan = resident, plan
-        self.records_per_view = resident.count
+        self.cloud, self.plan = cloud, plan
+        self.records_per_view = cloud.count
         """records per view: the number of splats, or with `culls_first` the capacity for unculled splats"""
         self.batch, self.view_count = batch, len(batch)
         self.view = view = batch.view
@@ -166,7 +166,7 @@ class DeviceFrame:
     def sub_frame(self, view: View) -> DeviceFrame:
         """The frame of `view`, one of the camera poses that a shutter averages."""
         batch = ViewBatch.single(view)
-        frame = DeviceFrame(self.workspace, self.commands, self.config, self.resident, batch, self.plan)
+        frame = DeviceFrame(self.workspace, self.commands, self.config, self.cloud, batch, self.plan)
         frame.is_sub_frame = True
         return frame
 

@@ -54,7 +54,7 @@ def allocate_samples(frame: DeviceFrame) -> None:
 
 def render_sort_first(frame: DeviceFrame) -> None:
     """Render on a CPU: wait for the number of pairs, then allocate the lists."""
-    count, big = frame.resident.count, 0
+    count, big = frame.cloud.count, 0
     frame.upload_view(0, frame.rows)
     while True:
         tiling.allocate_counters(frame, COUNTERS * frame.view_count, big)
@@ -93,7 +93,7 @@ def render_bin_first(frame: DeviceFrame) -> None:
     else:
         frame.counted, frame.pairs = counted, capacity
     frame.queue.flush()
-    reader, last, count = frame.workspace.read_queue, frame.events[-1], frame.resident.count
+    reader, last, count = frame.workspace.read_queue, frame.events[-1], frame.cloud.count
     frame.stats = partial(read_stats, reader, frame.buffers.frame_counts, last, count)
 
 
@@ -137,7 +137,7 @@ def render_in_slices(frame: DeviceFrame) -> None:
             blend(frame, tile_range)
         visible, pairs = max(visible, packed.visible), pairs + listed
     resolve(frame)
-    frame.stats = partial(dict, splats=frame.resident.count, visible=visible, pairs=pairs)
+    frame.stats = partial(dict, splats=frame.cloud.count, visible=visible, pairs=pairs)
 
 
 def blend(frame: DeviceFrame, tile_range: TileRange) -> None:
@@ -180,7 +180,7 @@ def render_sub_frames(frame: DeviceFrame) -> None:
         for name, argument in frame.source.arguments.get("composite_background", {}).items()
         if argument.source == "array"
     }
-    stats = {"splats": frame.resident.count, "visible": 0, "pairs": 0}
+    stats = {"splats": frame.cloud.count, "visible": 0, "pairs": 0}
     for sub_frame in frame.view.sub_frames:
         blended = frame.sub_frame(sub_frame.view)
         blended.named |= background_arrays

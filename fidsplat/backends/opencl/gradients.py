@@ -27,12 +27,12 @@ from fidsplat.backends.opencl.assemble import (
     segment_size,
 )
 from fidsplat.backends.opencl.buffers import DeviceRecord
+from fidsplat.backends.opencl.cloud import OpenCLCloud
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uniforms import scalar_arguments
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
@@ -84,14 +84,14 @@ class OpenCLGradients(GradientPipeline):
         self.step_commands: dict[bool, CommandList] = {}
         """command lists of `TileGradients.step`, without and with refinement of views"""
 
-    def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
+    def forward(self, cloud: OpenCLCloud, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """Render one frame. waits: whether to wait for its counts, as the first frame on a GPU must."""
         pipeline = self._pipeline
         with pipeline.workspace.lock:
             if waits or not self._pair_limit:
-                frame = pipeline.render_undivided(resident, view)
+                frame = pipeline.render_undivided(cloud, view)
             else:
-                frame = pipeline.replay_undivided(resident, view, self._pair_limit)
+                frame = pipeline.replay_undivided(cloud, view, self._pair_limit)
             return OpenCLDifferentiable(frame, pipeline.images_of(frame))
 
     def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
@@ -111,7 +111,7 @@ class OpenCLGradients(GradientPipeline):
         """A copy of the frame that launches kernels of the program `gradients` and has their buffers."""
         frame = copy(forward)
         frame.commands, frame.source = self._tile_commands, self.source
-        frame.scratch("gradient_offsets", 4 * frame.resident.count)
+        frame.scratch("gradient_offsets", 4 * frame.cloud.count)
         frame.scratch("record_gradients", self.source.records["RecordGradient"].itemsize * frame.pairs)
         frame.scratch("background_sums", 3 * self.source.scalar_types.dtype("real").itemsize * frame.tiles)
         return frame
@@ -140,7 +140,7 @@ class OpenCLGradients(GradientPipeline):
         """Key of the backward pass's command list: its buffers; None if the host waited for the counts."""
         if frame.counted is None:
             return None
-        count, size = frame.resident.count, (frame.view.width, frame.view.height)
+        count, size = frame.cloud.count, (frame.view.width, frame.view.height)
         return frame.pool.generation, count, frame.capacity, size
 
     def _record_blend_backward(self, frame: DeviceFrame, log_ceiling: float) -> None:
@@ -151,7 +151,7 @@ class OpenCLGradients(GradientPipeline):
         if not in_groups:
             rows = -(-frame.view.height // config.tile_height)
             frame.scratch("big_rows", 4 * frame.scalars["big_capacity"] * rows)
-        if count := frame.resident.count:
+        if count := frame.cloud.count:
             frame.launch("reserve", "reserve_gradients", (count,), (_GROUP,), count=count)
         groups = segments if in_groups else min(frame.tiles, frame.workspace.info.compute_units)
         if in_groups:
@@ -222,12 +222,11 @@ class TileGradients:
             frame = copy(self._frame)
             frame.commands = pipeline.sum_commands
             frame.commands.clear()
-            count, groups = frame.resident.count, self._allocate_camera_sums(frame)
+            count, groups = frame.cloud.count, self._allocate_camera_sums(frame)
             results = self._allocate_results(frame)
             if count:
                 arrays: dict[str, Any] = {
-                    name: frame.resident.array_in_cloud_order(name, 0, count)
-                    for name in pipeline.cloud_arrays
+                    name: frame.cloud.array_in_cloud_order(name, 0, count) for name in pipeline.cloud_arrays
                 }
                 frame.launch(
                     "project backward", "project_backward", (count,), (_GROUP,), count=count, **arrays
@@ -245,7 +244,7 @@ class TileGradients:
         with self._latest_frame():
             refined = next_record is not None
             frame, commands = self._frame, self.pipeline.step_commands[refined]
-            count = frame.resident.count
+            count = frame.cloud.count
             arguments = {**arguments, "count": count}
             if refined:
                 arguments["groups"] = self._allocate_camera_sums(frame)
@@ -278,7 +277,7 @@ class TileGradients:
 
     def _allocate_camera_sums(self, frame: DeviceFrame) -> int:
         """Allocate the sums of work-groups for the camera, and return the number of work-groups."""
-        groups = -(-frame.resident.count // _GROUP)
+        groups = -(-frame.cloud.count // _GROUP)
         real = self.pipeline.source.scalar_types.dtype("real").itemsize
         frame.scratch("camera_sums", _CAMERA * real * groups)
         return groups
@@ -293,7 +292,7 @@ class TileGradients:
 
     def _allocate_results(self, frame: DeviceFrame) -> dict[str, Array]:
         """Arrays for the gradients, reused by every call."""
-        count, features = frame.resident.count, self.pipeline.features
+        count, features = frame.cloud.count, self.pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
             **{"means": (count, 3), "quats": (count, 4), "scales": (count, 2), "opacities": (count,)},
             **{"grad2d": (count,)},

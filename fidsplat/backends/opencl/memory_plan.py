@@ -15,9 +15,9 @@ from typing import NamedTuple
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.opencl.assemble import KernelSource
 from fidsplat.backends.opencl.buffers import RayBuffers
+from fidsplat.backends.opencl.cloud import OpenCLCloud
 from fidsplat.backends.opencl.kernel_config import KernelConfig
 from fidsplat.backends.opencl.kernel_interface import RAW
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.ranges import even_ranges
 from fidsplat.backends.view import View
@@ -90,12 +90,12 @@ class MemoryPlanner:
     def tiles(self, view: View) -> int:
         return -(-view.width // self._config.tile_width) * -(-view.height // self._config.tile_height)
 
-    def plan_frame(self, resident: Resident, view: View, reserved: int = 0) -> MemoryPlan:
+    def plan_frame(self, cloud: OpenCLCloud, view: View, reserved: int = 0) -> MemoryPlan:
         """Plan one view. reserved: bytes of other buffers. Raises DeviceError if it does not fit."""
         config = self._config
-        resident_bytes, upload_bytes = resident.bytes_for(self._source.cloud_arrays)
+        cloud_bytes, upload_bytes = cloud.bytes_for(self._source.cloud_arrays)
         samples, tables = self._samples_and_tables(view)
-        fixed = reserved + resident_bytes + UNIFORM_BYTES + tables
+        fixed = reserved + cloud_bytes + UNIFORM_BYTES + tables
         fixed += MIN_BIG * (4 + self._source.records["Bounds"].itemsize)
         # with sub-frames: the samples of the current one, and those accumulated
         fixed += 4 * samples * self._channels * (2 if view.sub_frames else 1)
@@ -111,32 +111,32 @@ class MemoryPlanner:
             fixed += RayBuffers.bytes_of(rasters, config.tile_height, columns, self._has_ray_derivatives)
         record = self._source.records["Splat"].itemsize
         budget, largest = self._workspace.memory_budget, self._workspace.largest_buffer
-        return plan_of(resident.capacity, record, upload_bytes, fixed, config.binning, budget, largest)
+        return plan_of(cloud.padded_count, record, upload_bytes, fixed, config.binning, budget, largest)
 
-    def plan_batch(self, resident: Resident, views: ViewBatch) -> Iterator[SubBatch]:
+    def plan_batch(self, cloud: OpenCLCloud, views: ViewBatch) -> Iterator[SubBatch]:
         """Divide a batch into sub-batches."""
         count, other_images = len(views), (views.total - 1) * self._image_bytes(views.view)
         if not count:
             return
-        plan = self.plan_frame(resident, views.view_at(0), other_images)
+        plan = self.plan_frame(cloud, views.view_at(0), other_images)
         external = views.view.external_depth
-        batched = views.same_uniforms and not (resident.streamed or self._views_differ_beyond_struct)
+        batched = views.same_uniforms and not (cloud.streamed or self._views_differ_beyond_struct)
         batched = batched and not (external and external.stacked)
         if plan.slice_size or not batched or (views.camera_parameters and self._has_camera_uniforms):
             for k in range(count):
-                yield SubBatch(k, k + 1, self.plan_frame(resident, views.view_at(k), other_images))
+                yield SubBatch(k, k + 1, self.plan_frame(cloud, views.view_at(k), other_images))
             return
         samples, tables = self._samples_and_tables(views.view)
         splat_bytes = self._source.records["Splat"].itemsize + KEY_BYTES + WINDOW_BYTES
         splat_bytes += SORT_BYTES if self._config.binning == "sort_first" else 0
-        view_bytes = resident.capacity * splat_bytes + tables + 4 * self._channels * samples
+        view_bytes = cloud.padded_count * splat_bytes + tables + 4 * self._channels * samples
         free = min(self._workspace.memory_budget - plan.total + view_bytes, self._workspace.largest_buffer)
         max_views = (
             min(free, SUB_BATCH_BYTES.get(self._workspace.info.kind, OTHER_SUB_BATCH_BYTES)) // view_bytes
         )
         for first, end in even_ranges(count, max(1, min(max_views, _SUB_BATCH_SAMPLES // samples))):
             yield SubBatch(
-                first, end, MemoryPlan(0, resident.count, plan.total + (end - first - 1) * view_bytes)
+                first, end, MemoryPlan(0, cloud.count, plan.total + (end - first - 1) * view_bytes)
             )
 
     def _image_bytes(self, view: View) -> int:
@@ -160,7 +160,7 @@ def plan_of(
     Args:
         record_bytes: bytes of the struct `Splat`.
         upload_bytes: bytes per splat that each frame copies to the device; 0 for a resident cloud.
-        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it is resident.
+        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it is cloud.
         binning: tile-binning strategy.
         budget: maximum total bytes.
         limit: maximum bytes of one buffer.

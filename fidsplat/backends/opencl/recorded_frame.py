@@ -13,11 +13,11 @@ from functools import partial
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.opencl.cloud import OpenCLCloud
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.counts import COUNTERS, Capacity, Counts, enlarged, read_stats
 from fidsplat.backends.opencl.device_frame import DeviceFrame, Rendered
 from fidsplat.backends.opencl.memory_plan import MemoryPlan
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.uniforms import view_arguments
 from fidsplat.backends.view import View
 
@@ -107,7 +107,7 @@ class RecordedFrame:
 
     def replay_into(self, frame: DeviceFrame) -> None:
         """Replay the bound view, and bind its buffers to `frame` for the backward pass."""
-        rendered = self.submit(frame.queue, frame.resident.count)
+        rendered = self.submit(frame.queue, frame.cloud.count)
         assert rendered is not None  # on CPUs frames with derivatives are not replayed
         frame.acquired, events = rendered.acquired, rendered.events
         for name in self._scratch_names:
@@ -125,42 +125,42 @@ class Replay:
     def __init__(
         self,
         recorded: RecordedFrame,
-        resident: Resident,
+        cloud: OpenCLCloud,
         view: View,
-        render_again: Callable[[Resident, View], Rendered],
+        render_again: Callable[[OpenCLCloud, View], Rendered],
     ) -> None:
         """render_again: function that renders the view with sufficient buffers."""
         self._recorded, self._view, self._render_again = recorded, view, render_again
         self._frame_number, self._capacity = recorded.workspace.frames, recorded.capacity
-        self._resident: Resident | None = resident
-        self._weak_resident = weakref.ref(resident)
+        self._cloud: OpenCLCloud | None = cloud
+        self._weak_cloud = weakref.ref(cloud)
 
     def render_on_overflow(self, rendered: Rendered) -> Rendered | None:
         """Render the frame again if its counts exceed the capacity; None if it is complete."""
-        resident, workspace = self._resident, self._recorded.workspace
-        if resident is None:
+        cloud, workspace = self._cloud, self._recorded.workspace
+        if cloud is None:
             return None
         queue, after = rendered.queue, None  # faster than waiting from another queue
         if workspace.frames != self._frame_number:  # later frames were submitted: do not wait for them
             queue.flush()
             queue, after = workspace.read_queue, rendered.events[-1:]
         counts = Counts.read(queue, rendered.acquired["frame_counts"], after)
-        complete = None if self._capacity.holds(counts) else self._render_again(resident, self._view)
-        self._resident = None  # release the cloud, which is no longer needed
+        complete = None if self._capacity.holds(counts) else self._render_again(cloud, self._view)
+        self._cloud = None  # release the cloud, which is no longer needed
         return complete
 
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage, from another replay with profiling; empty if the cloud was released."""
-        resident, recorded, workspace = self._weak_resident(), self._recorded, self._recorded.workspace
-        if resident is None:
+        cloud, recorded, workspace = self._weak_cloud(), self._recorded, self._recorded.workspace
+        if cloud is None:
             return {}
         with workspace.rendering():
             queue = workspace.switch_to(workspace.queue)
             workspace.frames += 1
             rendered = None
             if recorded.set_view(self._view, queue):
-                rendered = recorded.submit(queue, resident.count)
-            rendered = rendered or self._render_again(resident, self._view)
+                rendered = recorded.submit(queue, cloud.count)
+            rendered = rendered or self._render_again(cloud, self._view)
             workspace.finish()
             workspace.pool.release(rendered.acquired.items())
         return rendered.timings()

@@ -63,10 +63,10 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
 def cull(frame: DeviceFrame, big: int) -> None:
     """List the groups of splats that are not culled by their bounding spheres, and set
     `frame.records_per_view`."""
-    pool, culling_groups = frame.pool, -(-frame.resident.count // CULLING_GROUP)
+    pool, culling_groups = frame.pool, -(-frame.cloud.count // CULLING_GROUP)
     frame.scratch("unculled", 4 * MIN_BIG // CULLING_GROUP)
     for name in ("spheres", "max_scales", "splat_ids"):
-        frame.named[name] = frame.resident.sorted_array(name)
+        frame.named[name] = frame.cloud.sorted_array(name)
     while True:
         capacity = min(pool.size("unculled") // 4, culling_groups)
         frame.records_per_view = CULLING_GROUP * capacity
@@ -95,11 +95,11 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
         # the kernel writes no window for splats outside `View.sample_rows`, so windows are first set to empty
         cl.enqueue_fill_buffer(frame.queue, windows, _NO_WINDOW, 0, WINDOW_BYTES * size)
     if count:
-        resident, names = frame.resident, frame.source.cloud_arrays
+        cloud, names = frame.cloud, frame.source.cloud_arrays
         if frame.config.culls_first:
-            arrays, count = {name: resident.sorted_array(name) for name in names}, size
+            arrays, count = {name: cloud.sorted_array(name) for name in names}, size
         else:
-            arrays = {name: resident.array_in_cloud_order(name, first, end) for name in names}
+            arrays = {name: cloud.array_in_cloud_order(name, first, end) for name in names}
         batch = frame.config.splats_per_item
         items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
         frame.launch("project", "project", (items,), (group,), frame.view_count, count=count, **arrays)
@@ -107,8 +107,8 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:
     """Number of elements of a buffer with one per splat and view; for a complete cloud it is rounded up."""
-    resident = frame.resident
-    return frame.view_count * (resident.capacity if count == resident.count else count)
+    cloud = frame.cloud
+    return frame.view_count * (cloud.padded_count if count == cloud.count else count)
 
 
 # on CPUs: sort by depth, then append to tile lists
@@ -222,7 +222,7 @@ def pack_visible(frame: DeviceFrame, top: int, end: int) -> PackedCounts:
 def _pack_slices(frame: DeviceFrame, packed: dict[str, cl.Buffer]) -> tuple[PackedCounts, int]:
     """Project and pack slices until a capacity is exceeded. Returns the packed splats, and the number of big
     splats if it exceeded the capacity, else 0."""
-    count, size, blocks = frame.resident.count, frame.plan.slice_size, frame.config.sort_blocks
+    count, size, blocks = frame.cloud.count, frame.plan.slice_size, frame.config.sort_blocks
     out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
     total = visible = 0
     for start in range(0, count, size):
@@ -273,7 +273,7 @@ def project_and_count(frame: DeviceFrame, big: int = 0) -> None:
     allocate_counters(frame, COUNTERS + frame.tiles, big)
     if frame.config.culls_first:
         cull(frame, big)
-    project(frame, 0, frame.resident.count)
+    project(frame, 0, frame.cloud.count)
     count = frame.records_per_view
     frame.launch("bin", "count_big", (_big_groups(frame) * _ITEMS,), (_ITEMS,), count=count)
     if frame.config.binning == "bin_local":
@@ -326,7 +326,7 @@ def fill_and_sort_lists(
 
 def launch_local(frame: DeviceFrame, kernel: str, **arguments: Any) -> None:
     """Submit a kernel of tile_lists_local.cl."""
-    count, items = frame.resident.count, frame.config.scan_items
+    count, items = frame.cloud.count, frame.config.scan_items
     if count:
         work_groups = -(-count // _WORK_GROUP_SPLATS)
         frame.launch(

@@ -11,9 +11,9 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.opencl.assemble import assemble_training
+from fidsplat.backends.opencl.cloud import OpenCLCloud
 from fidsplat.backends.opencl.command_list import CommandList
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.view_refinement import OpenCLViewRefinement
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
@@ -66,7 +66,7 @@ Launch: TypeAlias = tuple[str, tuple[int, ...], tuple[int, ...], list[Any]]
 """kernel, size, work-group, and values of the arguments"""
 
 
-class ResidentArrays(Resident):
+class ResidentArrays(OpenCLCloud):
     """Device arrays of splats in training as a resident cloud, without labels and coplanar groups."""
 
     has_coplanar_groups, footprint, immutable = False, "gaussian", False

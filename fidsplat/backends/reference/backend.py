@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.interface import Backend, DeviceInfo, HostImages, Pipeline, ResidentData
+from fidsplat.backends.interface import Backend, DeviceCloud, DeviceInfo, HostImages, Pipeline
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_contribute
 from fidsplat.backends.reference.gradients import ReferenceGradients
@@ -85,14 +85,14 @@ class ReferenceBackend(Backend):
         return ReferenceGradients(self.pipeline(features), features)
 
 
-class ReferenceCloud(ResidentData):
+class ReferenceCloud(DeviceCloud):
     def __init__(self, cloud: SplatCloud) -> None:
-        self.cloud, self.count = cloud, len(cloud)
+        self.host_cloud, self.count = cloud, len(cloud)
         self.memory_bytes = 0  # nothing is copied to a device
         self.copy_properties(cloud)
 
     def color_range(self) -> tuple[float, float]:
-        return color_range(self.cloud.plain_colors, self.cloud.sh)
+        return color_range(self.host_cloud.plain_colors, self.host_cloud.sh)
 
 
 class ReferencePipeline(Pipeline):
@@ -101,12 +101,12 @@ class ReferencePipeline(Pipeline):
     def __init__(self, features: FeatureSet) -> None:
         self.features, self._progress = features, _Progress()
 
-    def render_view(self, resident: ReferenceCloud, view: View) -> HostImages:
-        return self.render_subsampled(resident, view, 1)
+    def render_view(self, cloud: ReferenceCloud, view: View) -> HostImages:
+        return self.render_subsampled(cloud, view, 1)
 
     def render_subsampled(
         self,
-        resident: ReferenceCloud,
+        cloud: ReferenceCloud,
         view: View,
         step: int,
         progress: Callable[[float], object] | None = None,
@@ -117,21 +117,21 @@ class ReferencePipeline(Pipeline):
         start = time.perf_counter()
         self._progress = _Progress(progress, rows.size * view.samples**2)
         # tiles as in the complete frame, so that sums have the same order
-        flat = self.pixels(resident, view, rows.ravel(), columns.ravel(), widest=_TILE)
+        flat = self.pixels(cloud, view, rows.ravel(), columns.ravel(), widest=_TILE)
         images = {name: image.reshape(1, *rows.shape, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3
-        count = len(resident.cloud)
+        count = len(cloud.host_cloud)
         return HostImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
 
-    def render_intermediates(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
+    def render_intermediates(self, cloud: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the depth order, the float32 keys, and the images with the error bound."""
-        splats = ProjectedSplats(resident.cloud, view, self.features)
-        images = self.render_view(resident, view).arrays_of(0)
+        splats = ProjectedSplats(cloud.host_cloud, view, self.features)
+        images = self.render_view(cloud, view).arrays_of(0)
         return {"order": splats.order, "keys": splats.key, **images}
 
     def pixels(
         self,
-        resident: ReferenceCloud,
+        cloud: ReferenceCloud,
         view: View,
         rows: np.ndarray,
         columns: np.ndarray,
@@ -144,16 +144,16 @@ class ReferencePipeline(Pipeline):
         y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
         x = (np.asarray(columns)[:, None] * n + sub_columns.ravel() + 0.5).ravel()
         sampled = self._exposed if view.sub_frames else self._samples
-        flat = sampled(resident, view, x, y, widest)
+        flat = sampled(cloud, view, x, y, widest)
         samples = {name: values.reshape(-1, n * n, *values.shape[1:]) for name, values in flat.items()}
         samples |= {"x": x.reshape(-1, n * n), "y": y.reshape(-1, n * n)}
         return resolve(samples, view, self.features)
 
     def _samples(
-        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
+        self, cloud: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
         """Sample buffers (k, ...) at grid positions x, y (k,)."""
-        splats = ProjectedSplats(resident.cloud, view, self.features)
+        splats = ProjectedSplats(cloud.host_cloud, view, self.features)
         if len(x) * len(splats.order) <= _BLOCK:
             return composite(splats, view, self.features, x, y)
         order, starts = _by_tile(view, x, y, widest)
@@ -169,7 +169,7 @@ class ReferencePipeline(Pipeline):
         return {name: np.concatenate([part[name] for part in parts])[inverse] for name in parts[0]}
 
     def _exposed(
-        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
+        self, cloud: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
         """Combine the samples of several sub-frames: colour, fog and transmittance are averaged; other
         outputs and `error_bound_middle` are from the middle sub-frame."""
@@ -179,7 +179,7 @@ class ReferencePipeline(Pipeline):
         ]
         self._progress.total = sum(int(members.sum()) for members in rows_of)
         for sub_frame, members in zip(view.sub_frames, rows_of, strict=True):
-            samples = self._samples(resident, sub_frame.view, x[members], y[members] - sub_frame.top, widest)
+            samples = self._samples(cloud, sub_frame.view, x[members], y[members] - sub_frame.top, widest)
             samples["error_bound_middle"] = samples["error_bound"]
             for name, values in samples.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))

@@ -30,9 +30,9 @@ class ReferenceGradients(GradientPipeline):
         self._pipeline, self._features = pipeline, features
         self._last: tuple[Images, FrozenFrame] | None = None
 
-    def forward(self, resident: Any, view: View, waits: bool = True) -> Images:
-        images = self._pipeline.render_view(resident, view)
-        self._last = images, FrozenFrame(resident.cloud, view, self._features)
+    def forward(self, cloud: Any, view: View, waits: bool = True) -> Images:
+        images = self._pipeline.render_view(cloud, view)
+        self._last = images, FrozenFrame(cloud.host_cloud, view, self._features)
         return images
 
     def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -10,13 +10,13 @@ import numpy as np
 
 from fidsplat.backends.interface import Backend, DeviceInfo
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.cloud import WarpCloud
 from fidsplat.backends.warp.command_list import LaunchCache
 from fidsplat.backends.warp.gradients import WarpGradients
 from fidsplat.backends.warp.kernel_config import KernelConfig, config_for, other_configs
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.probe import WarpProbe
 from fidsplat.backends.warp.program import Program, unsupported
-from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
@@ -69,11 +69,11 @@ class WarpBackend(Workspace, Backend):
         larger cloud is an error."""
         self.memory_budget = budget
 
-    def upload(self, cloud: SplatCloud) -> Resident:
-        return Resident.of(cloud, self.pool)
+    def upload(self, cloud: SplatCloud) -> WarpCloud:
+        return WarpCloud.of(cloud, self.pool)
 
-    def wrap_arrays(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
-        return Resident.around(arrays, origin, self.pool)
+    def wrap_arrays(self, arrays: Mapping[str, Any], origin: np.ndarray) -> WarpCloud:
+        return WarpCloud.around(arrays, origin, self.pool)
 
     def unsupported(self, features: FeatureSet) -> str:
         return unsupported(features, self.info.name)

@@ -16,10 +16,10 @@ from typing import Any
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.ranges import split_by_cost
 from fidsplat.backends.view import SubFrame
+from fidsplat.backends.warp.cloud import WarpCloud
 from fidsplat.backends.warp.command_list import BLOCK, Launcher
 from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
-from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.uniforms import array_of, environment_of, lens_of, moving_of, rays_of, uniforms
 from fidsplat.backends.warp.workspace import ArrayPool
@@ -45,7 +45,7 @@ class DeviceFrame:
         self,
         program: Program,
         planner: MemoryPlanner,
-        resident: Resident,
+        cloud: WarpCloud,
         batch: ViewBatch,
         launcher: Launcher,
         reserved: int = 0,
@@ -57,13 +57,13 @@ class DeviceFrame:
         fills for the views."""
         self.program, self.planner, self.workspace = program, planner, planner.workspace
         self.pool = self.workspace.pool
-        self.resident, self.launcher = resident, launcher
+        self.cloud, self.launcher = cloud, launcher
         self.reserved, self.capacity = reserved, capacity
         self.inputs = inputs or self.pool
         self.wp = load()
         view, config = batch.view, program.config
         columns, rows = -(-view.width // config.tile_width), -(-view.height // config.tile_height)
-        self.views, self.splats = len(batch), len(batch) * resident.count
+        self.views, self.splats = len(batch), len(batch) * cloud.count
         self.tiles = self.views * rows * columns
         self.grid = rows * config.tile_height, columns * config.tile_width
         """rows and columns of samples of a view"""
@@ -71,7 +71,7 @@ class DeviceFrame:
         """arrays and structs by the names of the kernels' parameters"""
         self.tile_ranges = 0
         """number of ranges of tiles in which the frame was rendered"""
-        self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
+        self.stats: dict[str, int] = {"splats": cloud.count, "visible": 0, "pairs": 0}
         self.set_views(batch)
 
     def set_views(self, batch: ViewBatch) -> None:
@@ -82,7 +82,7 @@ class DeviceFrame:
             return  # each sub-frame fills its own inputs
         self._fill_views()
         self.named["lens"] = lens_of(view, self.workspace)
-        self.named["moving"] = moving_of(self.resident, batch, inputs)
+        self.named["moving"] = moving_of(self.cloud, batch, inputs)
         arguments = {
             "has_ray_derivatives": program.has_ray_derivatives,
             "has_external_depth": program.has_external_depth,
@@ -92,7 +92,7 @@ class DeviceFrame:
             self.named["environment"] = environment_of(view, self.workspace)
 
     def _fill_views(self) -> None:
-        program, count = self.program, self.resident.count
+        program, count = self.program, self.cloud.count
         numbers = uniforms(self.batch, program.config, count, program.has_ray_derivatives)
         self.named["views"] = self.inputs.filled("views", numbers, kernels("common").View)
 
@@ -106,7 +106,7 @@ class DeviceFrame:
         reserved = self.reserved + self.planner.sample_bytes(self.view)
         for sub_frame in self.view.sub_frames:
             batch = ViewBatch.single(sub_frame.view)
-            part = DeviceFrame(self.program, self.planner, self.resident, batch, self.launcher, reserved)
+            part = DeviceFrame(self.program, self.planner, self.cloud, batch, self.launcher, reserved)
             samples = part._render_pose()
             self.launcher.stage("accumulate")
             self._accumulate(sub_frame, samples, accumulated)
@@ -174,10 +174,10 @@ class DeviceFrame:
         totals = self._scratch("totals", 2, wp.int64)
         counters.zero_()
         # placeholders, which kernels do not read if all splats have one primitive
-        cloud = {"boxes": counts, "coplanar_groups": counts, "thickness": self.resident.arrays["opacities"]}
-        cloud |= self.resident.arrays
+        arrays = {"boxes": counts, "coplanar_groups": counts, "thickness": self.cloud.arrays["opacities"]}
+        arrays |= self.cloud.arrays
         if n:
-            self._launch(self.program.project, n, block=self.program.project_block, **cloud)
+            self._launch(self.program.project, n, block=self.program.project_block, **arrays)
             self._list_big({"cursors": counters, "first_cursor": first_tile, "capacity": 0})
         unlimited = 2**31 - 1
         self._start_lists(0, self.tiles, unlimited if self.capacity is None else self.capacity)
@@ -201,7 +201,7 @@ class DeviceFrame:
 
     def _tile_ranges(self, pairs: int) -> Iterator[tuple[int, int, int]]:
         """Split the tiles into ranges (first, end, pairs) whose lists fit the budgets; usually one."""
-        limit = self.planner.max_pairs(self.resident, self.batch, self.reserved)
+        limit = self.planner.max_pairs(self.cloud, self.batch, self.reserved)
         if pairs <= limit:
             return iter([(0, self.tiles, pairs)])
         lengths = self.named["counters"].numpy()[self.program.lists.COUNTERS :]
@@ -210,7 +210,7 @@ class DeviceFrame:
     def fits(self, capacity: int) -> bool:
         """Whether a frame with this number of pairs fits the budgets in one range of tiles."""
         try:
-            return capacity <= self.planner.max_pairs(self.resident, self.batch, self.reserved)
+            return capacity <= self.planner.max_pairs(self.cloud, self.batch, self.reserved)
         except DeviceError:
             return False
 
@@ -236,7 +236,7 @@ class DeviceFrame:
     def _blend(self, first: int, end: int, samples: Any) -> None:
         program, config = self.program, self.program.config
         # a placeholder, which kernels do not read
-        groups = self.resident.arrays.get("coplanar_groups", self.named["lists"])
+        groups = self.cloud.arrays.get("coplanar_groups", self.named["lists"])
         arguments = {**self.named, "rays": self._rays, "samples": samples, "coplanar_groups": groups}
         area = config.tile_width * config.tile_height
         if config.schedule == "group":
@@ -258,7 +258,7 @@ class DeviceFrame:
         for name, array in arrays.items():
             setattr(out, name, array)
         for name in program.cloud_arrays:
-            setattr(out, name, self.resident.arrays[name])
+            setattr(out, name, self.cloud.arrays[name])
         for name, dtype in program.view_arrays.items():
             setattr(out, name, self.inputs.filled(name, array_of(self.batch, name), dtype))
         arguments = {

@@ -11,12 +11,12 @@ import numpy as np
 from fidsplat.backends.gradients import NOT_LATEST_FRAME, DifferentiableImages, check_shape, gradient_shape
 from fidsplat.backends.interface import GradientPipeline
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.cloud import WarpCloud
 from fidsplat.backends.warp.command_list import Launcher
 from fidsplat.backends.warp.frame import DeviceFrame
 from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.program import GradientKernels
-from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.effects.differentiable import check_gradients
 from fidsplat.util.errors import DeviceError, InputError
@@ -44,13 +44,13 @@ class WarpGradients(GradientPipeline):
     def __init__(self, pipeline: WarpPipeline) -> None:
         self._pipeline, self._kernels = pipeline, GradientKernels(pipeline.program)
 
-    def forward(self, resident: Resident, view: View, waits: bool = True) -> WarpDifferentiable:
+    def forward(self, cloud: WarpCloud, view: View, waits: bool = True) -> WarpDifferentiable:
         """Render one view; always waits."""
-        frame, images = self._pipeline.render_counted(resident, view)
+        frame, images = self._pipeline.render_counted(cloud, view)
         if frame.tile_ranges > 1:
             raise DeviceError(
                 "frames with derivatives must fit the memory budget without ranges of tiles, got "
-                f"{resident.count:,} splats; raise memory_budget, or use fewer splats or smaller images"
+                f"{cloud.count:,} splats; raise memory_budget, or use fewer splats or smaller images"
             )
         return WarpDifferentiable(frame, images)
 
@@ -69,10 +69,10 @@ class _Backward:
     def __init__(self, frame: DeviceFrame, made: GradientKernels, gradients: Mapping[str, Any]) -> None:
         self._frame, self._made, self._wp = frame, made, load()
         self._launcher: Launcher = frame.launcher
-        self._count, self._pairs = frame.resident.count, frame.stats["pairs"]
+        self._count, self._pairs = frame.cloud.count, frame.stats["pairs"]
         # a placeholder, which kernels do not read if all splats are disks
-        self._arguments = {**frame.named, "thickness": frame.resident.arrays["opacities"]}
-        self._arguments |= frame.resident.arrays | {"image_gradients": self._image_gradients(gradients)}
+        self._arguments = {**frame.named, "thickness": frame.cloud.arrays["opacities"]}
+        self._arguments |= frame.cloud.arrays | {"image_gradients": self._image_gradients(gradients)}
         self._arguments |= {
             "samples": frame.samples,
             "color": frame.samples.color,
@@ -191,7 +191,7 @@ class _Backward:
             "grad_scales": wp.vec2,
             "grad_opacities": wp.float32,
             "grad2d": wp.float32,
-        } | ({"grad_thickness": wp.float32} if self._frame.resident.ellipsoids != "none" else {})
+        } | ({"grad_thickness": wp.float32} if self._frame.cloud.ellipsoids != "none" else {})
         found = {name.removeprefix("grad_"): self._exact(name, count, dtype) for name, dtype in kinds.items()}
         self._arguments.setdefault(
             "grad_thickness", self._arguments["grad_opacities"]

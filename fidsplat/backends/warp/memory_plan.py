@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.ranges import even_ranges
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.cloud import WarpCloud
 from fidsplat.backends.warp.program import Program
-from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.uniforms import memory_bytes
 from fidsplat.backends.warp.workspace import Workspace
@@ -44,31 +44,31 @@ class MemoryPlanner:
         columns, rows = -(-view.width // self._tile_width), -(-view.height // self._tile_height)
         return rows * columns * self._tile_width * self._tile_height
 
-    def max_pairs(self, resident: Resident, batch: ViewBatch, reserved: int) -> int:
+    def max_pairs(self, cloud: WarpCloud, batch: ViewBatch, reserved: int) -> int:
         """Maximum number of (splat, tile) pairs in the lists at once. reserved: bytes of other arrays. Raises
         DeviceError if the rest of the frame exceeds the memory budget."""
         workspace = self.workspace
-        fixed = resident.memory_bytes + self._splat_bytes * len(batch) * resident.count
+        fixed = cloud.memory_bytes + self._splat_bytes * len(batch) * cloud.count
         fixed += len(batch) * self.sample_bytes(batch.view) + reserved + memory_bytes(batch.view, workspace)
         pairs = (workspace.memory_budget - fixed) // _PAIR
         if pairs < 1:
             raise DeviceError(
-                f"memory_budget must exceed the {bytes_words(fixed)} of the frame and its {resident.count:,} "
+                f"memory_budget must exceed the {bytes_words(fixed)} of the frame and its {cloud.count:,} "
                 f"splats without lists, got {bytes_words(workspace.memory_budget)}; raise it, or use an "
                 "OpenCL device, which projects a cloud in slices"
             )
         return min(workspace.pair_budget, pairs)
 
-    def plan_batch(self, resident: Resident, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
+    def plan_batch(self, cloud: WarpCloud, batch: ViewBatch, reserved: int) -> Iterator[tuple[int, int]]:
         """Ranges [first, end) of views that are rendered together. reserved: bytes of all their images."""
         count, workspace = len(batch), self.workspace
         if not count or not batch.same_uniforms or (self._same_settings and batch.camera_parameters):
             return even_ranges(count, 1)
-        each = resident.count * self._splat_bytes + self.sample_bytes(batch.view)
+        each = cloud.count * self._splat_bytes + self.sample_bytes(batch.view)
         external = batch.view.external_depth
         each += external.nbytes // count if external and external.stacked else 0
-        free = workspace.memory_budget - resident.memory_bytes - reserved
+        free = workspace.memory_budget - cloud.memory_bytes - reserved
         # half of the budget is for the lists
         fitting = min(free // 2, _MAX_SUB_BATCH_BYTES[workspace.device.is_cuda]) // each
-        numbered = _MAX_NUMBERED // max(self._samples(batch.view), resident.count * self._vec4s)
+        numbered = _MAX_NUMBERED // max(self._samples(batch.view), cloud.count * self._vec4s)
         return even_ranges(count, max(1, min(fitting, numbered)))

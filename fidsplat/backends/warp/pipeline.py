@@ -19,12 +19,12 @@ import numpy as np
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.interface import Pipeline
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.cloud import WarpCloud
 from fidsplat.backends.warp.command_list import LaunchCache, Launcher, capture
 from fidsplat.backends.warp.frame import DeviceFrame, ImageArrays
 from fidsplat.backends.warp.images import Rendered, WarpImages
 from fidsplat.backends.warp.memory_plan import MemoryPlanner
 from fidsplat.backends.warp.program import Program
-from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace
 
@@ -71,49 +71,49 @@ class WarpPipeline(Pipeline):
         self.outputs = {output.name: output for output in program.images}
         self._planner = MemoryPlanner(program, workspace)
         workspace.pool.holders.add(launches)
-        self._cached: WeakKeyDictionary[Resident, dict[tuple[int, int, int], _CachedFrame]] = (
+        self._cached: WeakKeyDictionary[WarpCloud, dict[tuple[int, int, int], _CachedFrame]] = (
             WeakKeyDictionary()
         )
 
-    def render_view(self, resident: Resident, view: View) -> WarpImages:
-        return self.render(resident, ViewBatch.single(view))
+    def render_view(self, cloud: WarpCloud, view: View) -> WarpImages:
+        return self.render(cloud, ViewBatch.single(view))
 
-    def render(self, resident: Resident, views: ViewBatch) -> WarpImages:
+    def render(self, cloud: WarpCloud, views: ViewBatch) -> WarpImages:
         wp, device = load(), self.workspace.device
         with self.workspace.working("while rendering"):
-            images, into = self._new_images(resident, views)
+            images, into = self._new_images(cloud, views)
             if views.is_single:
-                images.rendered.append(self._render(resident, views, into))
+                images.rendered.append(self._render(cloud, views, into))
                 return images
             if len(views) < views.total:
                 images.blank()
-            for first, end in self._planner.plan_batch(resident, views, images.nbytes):
+            for first, end in self._planner.plan_batch(cloud, views, images.nbytes):
                 indices = views.batch_indices[first:end].astype(np.int32)
                 indices = wp.array(indices, dtype=wp.int32, device=device)
                 sub_batch = views.sub_batch(first, end)
-                images.rendered.append(self._render(resident, sub_batch, replace(into, indices=indices)))
+                images.rendered.append(self._render(cloud, sub_batch, replace(into, indices=indices)))
             return images
 
-    def render_counted(self, resident: Resident, view: View) -> tuple[DeviceFrame, WarpImages]:
+    def render_counted(self, cloud: WarpCloud, view: View) -> tuple[DeviceFrame, WarpImages]:
         """Render one view and wait. Returns the images, and the frame, which is valid until the next
         frame."""
         with self.workspace.working("while rendering"):
             views = ViewBatch.single(view)
-            images, into = self._new_images(resident, views)
-            frame, rendered = self._render_counted(resident, views, into)
+            images, into = self._new_images(cloud, views)
+            frame, rendered = self._render_counted(cloud, views, into)
             images.rendered.append(rendered)
             return frame, images
 
-    def _new_images(self, resident: Resident, views: ViewBatch) -> tuple[WarpImages, ImageArrays]:
-        images = WarpImages(self.workspace, self.outputs, views.size, views.total, resident.count)
+    def _new_images(self, cloud: WarpCloud, views: ViewBatch) -> tuple[WarpImages, ImageArrays]:
+        images = WarpImages(self.workspace, self.outputs, views.size, views.total, cloud.count)
         return images, ImageArrays(images.allocate, self.workspace.first_index, images.nbytes)
 
-    def render_intermediates(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
+    def render_intermediates(self, cloud: WarpCloud, view: View) -> dict[str, np.ndarray]:
         """Render one view; returns the buffers between the stages: keys (n,) uint32; starts (tiles + 1,);
         lists (pairs,), of the last range of tiles; records (n, words) float32; raw (4, rows, columns)
         float32: r, g, b, transmittance; output images by name."""
-        frame, images = self.render_counted(resident, view)
-        named, stats, n = frame.named, images.stats, resident.count
+        frame, images = self.render_counted(cloud, view)
+        named, stats, n = frame.named, images.stats, cloud.count
         rows, stride = frame.grid
         raw = named["raw color"].numpy()[: rows * stride]
         records = named["records"].numpy()[: n * self.program.layout.vec4s]
@@ -127,27 +127,27 @@ class WarpPipeline(Pipeline):
         }
 
     def _render_counted(
-        self, resident: Resident, views: ViewBatch, into: ImageArrays
+        self, cloud: WarpCloud, views: ViewBatch, into: ImageArrays
     ) -> tuple[DeviceFrame, Rendered]:
         launcher = Launcher(self._launches)
-        frame = DeviceFrame(self.program, self._planner, resident, views, launcher, into.reserved)
+        frame = DeviceFrame(self.program, self._planner, cloud, views, launcher, into.reserved)
         self.workspace.frames += 1
         frame.render()
         if not views.view.sub_frames:
-            self._update_capacity(resident, views, frame.stats["pairs"])
+            self._update_capacity(cloud, views, frame.stats["pairs"])
         frame.resolve(into, launcher)
         return frame, Rendered(launcher, frame.stats)
 
-    def _render(self, resident: Resident, views: ViewBatch, into: ImageArrays) -> Rendered:
+    def _render(self, cloud: WarpCloud, views: ViewBatch, into: ImageArrays) -> Rendered:
         """Render views, without waiting if a frame with the same key is cached."""
         workspace, view = self.workspace, views.view
         # frames of the user's own arrays (`wrap_arrays`) must wait for their counts: a frame that overflows
         # its buffers is rendered again, and by then the user may have changed the arrays
-        if not workspace.asynchronous or view.sub_frames or resident.wraps_arrays or not resident.count:
-            return self._render_counted(resident, views, into)[1]
-        cached = self._cached.get(resident, {}).get((view.width, view.height, len(views)))
+        if not workspace.asynchronous or view.sub_frames or cloud.wraps_arrays or not cloud.count:
+            return self._render_counted(cloud, views, into)[1]
+        cached = self._cached.get(cloud, {}).get((view.width, view.height, len(views)))
         if cached is None:
-            return self._render_counted(resident, views, into)[1]
+            return self._render_counted(cloud, views, into)[1]
         # after a failure or another frame the inputs are undefined
         capacity, recorded, cached.recorded = cached.capacity, cached.recorded, None
         if recorded is not None and cached.token == self._token(cached, view, into.reserved):
@@ -155,21 +155,21 @@ class WarpPipeline(Pipeline):
             cached.recorded = recorded
             workspace.frames += 1
             launcher = Launcher(self._launches, timed=False)
-            return self._pending(resident, views, capacity, recorded.frame, launcher, into)
+            return self._pending(cloud, views, capacity, recorded.frame, launcher, into)
         launcher = Launcher(self._launches)
         given = into.reserved, capacity, cached.inputs
-        frame = DeviceFrame(self.program, self._planner, resident, views, launcher, *given)
+        frame = DeviceFrame(self.program, self._planner, cloud, views, launcher, *given)
         if not frame.fits(capacity):
-            return self._render_counted(resident, views, into)[1]
+            return self._render_counted(cloud, views, into)[1]
         workspace.frames += 1
         frame.render()
-        rendered = self._pending(resident, views, capacity, frame, launcher, into)
+        rendered = self._pending(cloud, views, capacity, frame, launcher, into)
         self._record(cached, frame, into.reserved)
         return rendered
 
     def _pending(
         self,
-        resident: Resident,
+        cloud: WarpCloud,
         views: ViewBatch,
         capacity: int,
         frame: DeviceFrame,
@@ -181,7 +181,7 @@ class WarpPipeline(Pipeline):
         acquired = pool.acquire("totals", 2, load().int64)
         load().copy(acquired[0], frame.named["totals"])
         frame.resolve(into, launcher)
-        rendered = Rendered(launcher, {"splats": resident.count, "visible": 0, "pairs": 0})
+        rendered = Rendered(launcher, {"splats": cloud.count, "visible": 0, "pairs": 0})
         # return the array to the pool for later frames
         weakref.finalize(rendered, pool.release, "totals", acquired)
         stats = rendered.counts  # the closure references only the counts, so that the object can be released
@@ -194,7 +194,7 @@ class WarpPipeline(Pipeline):
             if pairs <= capacity:
                 return None
             with workspace.working("while rendering"):
-                return self._render_counted(resident, views, into)[1]
+                return self._render_counted(cloud, views, into)[1]
 
         def profile() -> Mapping[str, float]:
             """Measure the stages by rendering again: one view into new arrays, a batch into its own."""
@@ -203,7 +203,7 @@ class WarpPipeline(Pipeline):
                 if len(views) == 1:
                     arrays = {name: load().empty_like(array) for name, array in into.allocate().items()}
                     own = replace(into, allocate=lambda: arrays)
-                return self._render_counted(resident, views, own)[1].timings()
+                return self._render_counted(cloud, views, own)[1].timings()
 
         rendered.complete = complete
         if not launcher.timed:
@@ -218,7 +218,7 @@ class WarpPipeline(Pipeline):
             graph = capture(self.workspace, frame.render)
             frame.launcher = before
             # recorded frames must not reference the cloud, which caches them
-            frame.resident = weakref.proxy(frame.resident)
+            frame.cloud = weakref.proxy(frame.cloud)
             cached.recorded = None if graph is None else RecordedFrame(frame, graph)
             self.workspace.pool.holders.add(cached)
         cached.token = token
@@ -231,8 +231,8 @@ class WarpPipeline(Pipeline):
         external = view.external_depth and view.external_depth.depth.shape
         return cached.capacity, budgets, states, view.raster, view.environment_map, labels, external
 
-    def _update_capacity(self, resident: Resident, views: ViewBatch, pairs: int) -> None:
-        kinds, kind = self._cached.setdefault(resident, {}), (views.view.width, views.view.height, len(views))
+    def _update_capacity(self, cloud: WarpCloud, views: ViewBatch, pairs: int) -> None:
+        kinds, kind = self._cached.setdefault(cloud, {}), (views.view.width, views.view.height, len(views))
         cached = kinds.get(kind)
         if cached is None:
             if len(kinds) >= _MAX_KINDS:

@@ -9,8 +9,8 @@ import numpy as np
 
 from fidsplat.backends.batched_views import ViewBatch
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.cloud import WarpCloud
 from fidsplat.backends.warp.kernel_config import KernelConfig
-from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.cameras.lenses import camera_effect
@@ -112,7 +112,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
     return lens
 
 
-def moving_of(resident: Resident, batch: ViewBatch, inputs: ArrayPool) -> Any:
+def moving_of(cloud: WarpCloud, batch: ViewBatch, inputs: ArrayPool) -> Any:
     """Struct `Moving` of a frame; empty without moving groups. inputs: pool for its arrays."""
     declared, groups = kernels("motion"), batch.view.groups
     kind = declared.make_motion(bool(groups)).Moving
@@ -123,7 +123,7 @@ def moving_of(resident: Resident, batch: ViewBatch, inputs: ArrayPool) -> Any:
     poses: Any = np.zeros((len(batch), len(groups)), declared.Pose.numpy_dtype())
     for name in ("rotation", "translation", "eye"):
         poses[name] = np.swapaxes(getattr(batch, name)[1:], 0, 1)
-    cached.labels = resident.arrays["labels"]
+    cached.labels = cloud.arrays["labels"]
     cached.groups = inputs.filled("groups", labels, load().int32)
     cached.poses = inputs.filled("poses", poses.ravel(), declared.Pose)
     return cached

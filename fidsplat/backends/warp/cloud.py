@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.cloud_arrays import kernel_arrays
-from fidsplat.backends.interface import ResidentData
+from fidsplat.backends.interface import DeviceCloud
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
 from fidsplat.splats.cloud import SplatCloud
@@ -16,7 +16,7 @@ from fidsplat.splats.harmonics import MAX_DEGREE, color_range
 from fidsplat.util.errors import DeviceError, InputError, bytes_words
 
 
-class Resident(ResidentData):
+class WarpCloud(DeviceCloud):
     def __init__(
         self,
         arrays: dict[str, Any],
@@ -42,7 +42,7 @@ class Resident(ResidentData):
         return color_range(colors, None)
 
     @classmethod
-    def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
+    def of(cls, cloud: SplatCloud, pool: ArrayPool) -> WarpCloud:
         arrays = kernel_arrays(cloud)
         if "sh" in arrays:
             arrays["colors"] = arrays.pop("sh").reshape(-1, 3)
@@ -53,7 +53,7 @@ class Resident(ResidentData):
         return cls(device, len(cloud), cloud.origin, cloud.sh_degree, *kinds)
 
     @classmethod
-    def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:
+    def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> WarpCloud:
         """Use arrays of the device or of NumPy. Raises InputError for a wrong shape, type or device."""
         arrays, ellipsoids = {name: _adopted(name, value, pool) for name, value in given.items()}, "none"
         count = arrays["means"].size
@@ -77,9 +77,9 @@ class Resident(ResidentData):
             if count and array.size != expected:
                 raise InputError(f"{name} must have {expected} elements for {count} means, got {array.size}")
         sh_degree = int(np.sqrt(terms)) - 1 if terms else -1
-        resident = cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
-        resident.wraps_arrays = True
-        return resident
+        cloud = cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
+        cloud.wraps_arrays = True
+        return cloud
 
 
 def _dtype(name: str) -> Any:

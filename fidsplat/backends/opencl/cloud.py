@@ -13,7 +13,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.cloud_arrays import kernel_arrays
-from fidsplat.backends.interface import ResidentData
+from fidsplat.backends.interface import DeviceCloud
 from fidsplat.backends.opencl.buffers import DeviceBuffer
 from fidsplat.backends.opencl.morton_order import MortonOrder
 from fidsplat.backends.opencl.workspace import Workspace
@@ -24,7 +24,7 @@ _VECTOR = 16
 """alignment in bytes of the vectors in which kernels read arrays"""
 
 
-class Resident(ResidentData):
+class OpenCLCloud(DeviceCloud):
     """Base class of clouds on an OpenCL device."""
 
     streamed = False
@@ -39,7 +39,7 @@ class Resident(ResidentData):
     """whether `sorted_array` is available"""
 
     def __init__(self, count: int) -> None:
-        self.count = self.capacity = count
+        self.count = self.padded_count = count
         """number of splats, and number of splats for which frames allocate buffers"""
         self._buffers: dict[str, cl.Buffer] = {}
         self.cached_frames: dict[tuple[Any, ...], Any] = {}
@@ -69,7 +69,7 @@ class Resident(ResidentData):
         return complete.get_sub_region(first * width, (end - first) * width)
 
 
-class UploadedCloud(Resident):
+class UploadedCloud(OpenCLCloud):
     """A SplatCloud on the device. A CPU reads the host's arrays. Other devices have copies; labels and
     colours are copied on first use. A cloud of more than half of the memory budget is `streamed`. When
     a frame needs cloud order, arrays in that order replace the sorted arrays for good."""
