@@ -54,7 +54,7 @@ class Train:
     random_points: int = 0
     """N: start from N random points instead of the data set's"""
     masks: str | None = None
-    """DIR: masks NAME.png of the images, 0 for ignored pixels (default: those of the data set)"""
+    """DIR: masks NAME.png of the images, 0 for ignored pixels, in addition to those of the data set"""
     alpha_masks: bool = False
     """ignore transparent pixels instead of blending them with the background"""
     start: str | None = None

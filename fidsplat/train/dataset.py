@@ -15,6 +15,8 @@ from fidsplat.train.random_numbers import RandomStream, uniform
 from fidsplat.util.arguments import instance, invalid, items, real_array, text, three_numbers, whole_number
 from fidsplat.util.errors import InputError
 
+DRAW_MASK = "draw the mask on this image, as undistortion and reduction move its pixels"
+"""remedy for a mask of another size"""
 FAR = 1e4
 """distance from the world origin, in scene extents, beyond which means are stored relative to a nearer
 origin, to avoid rounding errors of float32"""
@@ -57,7 +59,7 @@ class TrainingView:
         if self.mask is not None and self.mask.shape != shape[:2]:
             raise InputError(
                 f"the mask of {self.name} must be {shape[1]} x {shape[0]}, the size of its image, got "
-                f"{self.mask.shape[1]} x {self.mask.shape[0]}; resize one of them"
+                f"{self.mask.shape[1]} x {self.mask.shape[0]}; {DRAW_MASK}"
             )
         if camera.lens is not None:
             raise InputError(

@@ -48,7 +48,7 @@ def load_dataset(
         random_points: number of random initial points that replace those of the data set; 0 keeps these.
         seed: seed of the random points.
         progress: called with a description of the file and the fraction done, 0 to 1.
-        masks: folder of masks `NAME.png`, 0 for ignored pixels; None: the masks of the data set.
+        masks: folder of masks `NAME.png`, 0 for ignored pixels, in addition to the masks of the data set.
         alpha_masks: whether the loss ignores transparent pixels; otherwise they show the background.
 
     Raises:

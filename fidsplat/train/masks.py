@@ -9,7 +9,8 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.images.files import read_image, read_rgba
-from fidsplat.train.dataset import TrainingView
+from fidsplat.train.dataset import DRAW_MASK, TrainingView
+from fidsplat.util.errors import InputError
 from fidsplat.vision.undistort import undistort_masked
 
 _OPAQUE = 128
@@ -18,28 +19,32 @@ _OPAQUE = 128
 
 @dataclass(frozen=True)
 class Masks:
-    """Sources of masks, (h, w) bool, False for ignored pixels."""
+    """Sources of masks, (h, w) bool, False for ignored pixels, in addition to those of the data set."""
 
     folder: Path | None = None
-    """folder of masks; None: the masks of the data set"""
+    """folder of masks"""
     alpha: bool = False
     """whether the loss ignores transparent pixels; otherwise they show the background"""
 
     def of(self, image: Path, name: str, given: Path | None) -> np.ndarray | None:
-        """The mask of an image file; None if it has none.
+        """The mask of an image file, of the pixels that no source ignores; None if it has none.
 
         Args:
             name: name of the image in the data set.
             given: mask file of the data set.
+
+        Raises InputError for masks of different sizes.
         """
-        file = given if self.folder is None else mask_file(self.folder, name)
-        mask = None if file is None else read_image(file).max(axis=2) > 0
-        if not self.alpha:
-            return mask
-        opaque = read_rgba(image)[:, :, 3] >= _OPAQUE
-        if mask is not None and mask.shape == opaque.shape:
-            return mask & opaque
-        return opaque if mask is None else mask
+        files = [given, None if self.folder is None else mask_file(self.folder, name)]
+        masks = [read_image(file).max(axis=2) > 0 for file in files if file is not None]
+        if self.alpha:
+            masks.append(read_rgba(image)[:, :, 3] >= _OPAQUE)
+        sizes = list(dict.fromkeys(f"{mask.shape[1]} x {mask.shape[0]}" for mask in masks))
+        if len(sizes) > 1:
+            raise InputError(
+                f"the masks of {name} must have the size of its image, got {' and '.join(sizes)}; {DRAW_MASK}"
+            )
+        return np.logical_and.reduce(masks) if masks else None
 
 
 def mask_file(folder: Path, name: str) -> Path | None:

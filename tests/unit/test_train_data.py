@@ -128,6 +128,18 @@ def test_alpha_and_masks(original, tmp_path):
     np.testing.assert_array_equal(dataset.views[0].image, np.rint(original.views[0].image / 5))
     np.testing.assert_array_equal(dataset.views[1].mask, mask)
     assert read_rgba(folder / "mask.png").shape == (*mask.shape, 4)
+    people = np.random.default_rng(1).uniform(size=mask.shape) < 0.5
+    for name in ("1.png", "2.png"):
+        (tmp_path / "people").mkdir(exist_ok=True)
+        write_png(tmp_path / "people" / f"{name}.png", people)
+    dataset = load_dataset(folder, random_points=5, masks=tmp_path / "people", alpha_masks=True)
+    assert not dataset.views[0].mask.any()  # all pixels of the image are transparent
+    np.testing.assert_array_equal(dataset.views[1].mask, mask & people)
+    write_png(tmp_path / "people" / "2.png.png", np.ones((96, 128)))
+    with pytest.raises(
+        fs.InputError, match=r"masks of .* must have the size.*and 128 x 96; draw the mask on"
+    ):
+        load_dataset(folder, random_points=5, masks=tmp_path / "people")
 
 
 def test_points_as_text(original, tmp_path):
