@@ -17,7 +17,7 @@ from fidsplat.util.arguments import invalid
 from fidsplat.vision.boards import BOARDS, board_pose
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.pose import marker_pose, pose_error
-from fidsplat.vision.truth import MarkerTruth, at_shutter, marker_truth
+from fidsplat.vision.truth import MarkerTruth, at_shutter, marker_truths
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +175,7 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
 def _reading(
     placed: PlacedMarker, code: tuple[Detection, np.ndarray] | None, camera: Camera, label: np.ndarray | None
 ) -> Reading:
-    truth = marker_truth(placed, camera, label)
+    (truth,) = marker_truths([placed], camera, label)
     reading = Reading(**{field.name: getattr(truth, field.name) for field in fields(truth)})
     if code is None:
         return reading

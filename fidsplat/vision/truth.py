@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -96,16 +96,7 @@ def truth_of(frame: Mapping[str, np.ndarray], scene: Scene, camera: Camera | Non
     camera, markers = at_shutter(frame, scene, camera, np.shape(frame[first]))
     label = frame.get("label")
     groups = {} if label is None else groups_of(label)
-    corners = camera.project(np.reshape([placed.corners for placed in markers], (-1, 3))).reshape(-1, 4, 2)
-    parts = (
-        visible(placed, camera, label) if label is None or placed.label in groups else Visible(0.0, None)
-        for placed in markers
-    )
-    poses = (camera.world_to_camera @ placed.pose for placed in markers)
-    truths = zip(markers, poses, corners, parts, strict=True)
-    return Truth(
-        camera, [MarkerTruth(placed, pose, points, *part) for placed, pose, points, part in truths], groups
-    )
+    return Truth(camera, marker_truths(markers, camera, label, groups), groups)
 
 
 def at_shutter(
@@ -137,11 +128,21 @@ def at_shutter(
     return camera, markers
 
 
-def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> MarkerTruth:
-    """Ground truth of one marker for a camera. label: (h, w) int32, the labels of the image; None: no
-    occlusion."""
-    pose, corners = camera.world_to_camera @ placed.pose, camera.project(placed.corners)
-    return MarkerTruth(placed, pose, corners, *visible(placed, camera, label))
+def marker_truths(
+    markers: Sequence[PlacedMarker],
+    camera: Camera,
+    label: np.ndarray | None = None,
+    labels: Container[int] | None = None,
+) -> list[MarkerTruth]:
+    """Ground truth of markers for a camera. label: (h, w) int32, the labels of the image; None: no occlusion.
+    labels: those in this image, if they are known."""
+    corners = camera.project(np.reshape([placed.corners for placed in markers], (-1, 3))).reshape(-1, 4, 2)
+    truths = []
+    for placed, image_corners in zip(markers, corners, strict=True):
+        occluded = label is not None and labels is not None and placed.label not in labels
+        part = Visible(0.0, None) if occluded else visible(placed, camera, label)
+        truths.append(MarkerTruth(placed, camera.world_to_camera @ placed.pose, image_corners, *part))
+    return truths
 
 
 def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:

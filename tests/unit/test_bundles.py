@@ -15,7 +15,7 @@ from fidsplat.vision.bundles import read_bundles
 from fidsplat.vision.detect import Detection
 from fidsplat.vision.pose import marker_pose, pose_error
 from fidsplat.vision.readback import Reading
-from fidsplat.vision.truth import marker_truth
+from fidsplat.vision.truth import marker_truths
 
 THING = rigid_matrix((0.1, -0.05, 1.2), (1, 0.1, 0.15, 0.05))
 PARTS = (
@@ -35,7 +35,7 @@ def markers():
 
 def reading(placed, camera, noise=None):
     """Reading of a marker with corners that are off by an offset; None: not visible."""
-    expected = marker_truth(placed, camera)
+    (expected,) = marker_truths([placed], camera)
     actual = Reading(placed, expected.truth, expected.corners, expected.visible, expected.box)
     code = Detection(
         "apriltag", "36h11", placed.marker.id, None, expected.corners + (0 if noise is None else noise)
