@@ -94,8 +94,8 @@ class Tags(TagSettings):
     Renders markers in a greenhouse and in a captured scene, in the same poses for all causes, and reads them
     with OpenCV's aruco, the AprilTag library, locus-tag, zxing-cpp, OpenCV's QR detector and `detect`.
     Writes tags.jsonl, tags.csv with 95 % intervals, and a page with failure curves. An interrupted run
-    resumes. Several machines share the work by --shard, and `merge` joins their results; the same command
-    then writes the page.
+    resumes. Several machines share the work by --shard, and `fidsplat experiment merge` joins their results;
+    the same command then writes the page.
 
     Examples:
       fidsplat experiment tags --quick

@@ -32,8 +32,8 @@ TEST, TRAINING = "test", "view"
 
 
 def image_file(folder: Path, view: str, category: str, index: int, kind: str, number: int) -> Path:
-    """Path of an image of a marker. kind: `TEST`, or `TRAINING` (the largest training set); number: of the
-    image."""
+    """Path of an image of a marker. kind: `TEST`, or `TRAINING` (the largest training set); number: index
+    of the image in its kind."""
     return folder / view / f"{category}-{index}" / f"{kind}-{number:02d}.png"
 
 

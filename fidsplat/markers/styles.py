@@ -48,9 +48,9 @@ class Rule(NamedTuple):
     rank: tuple[int, int, int]
     """specificity: numbers of ids, classes and tags; of equal rules the later applies"""
     tag: str
-    """"" for any"""
+    """name of the elements that the rule selects; "" for any"""
     id: str
-    """"" for any"""
+    """`id` of the element that the rule selects; "" for any"""
     classes: frozenset[str]
     """required classes"""
     look: dict[str, str]

@@ -58,9 +58,9 @@ def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:
 
 
 def colors_of_degree(arrays: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
-    """`colors` or `sh` converted to an SH degree, with 0 for missing bands; degree -1: plain colours.
+    """`colors` or `sh` converted to an SH degree, with 0 for missing degrees; degree -1: plain colours.
 
-    arrays: of a cloud: `means`, and `colors` or `sh`; for degree -1, `sh` must have degree 0.
+    arrays: those of a cloud, with `means`, and `colors` or `sh`; for degree -1, `sh` must have degree 0.
     """
     if sh_degree < 0:
         if "colors" in arrays:
