@@ -11,7 +11,7 @@ from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture.capture import Capture
 from fidsplat.capture.sensor import Sensor
 from fidsplat.scenes.surface import Surface, fit_surface
-from fidsplat.util.arguments import number, real_array
+from fidsplat.util.arguments import instance, number, real_array
 from fidsplat.util.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,6 +56,10 @@ def surface_at(
     Raises:
         InputError: no plane in at least half of the patch; a pixel outside the image; unusable arguments.
     """
+    if camera is not None:
+        instance(
+            "camera", camera, Camera, "a Camera, with pixel=(x, y)", "give a ray as ray=(origin, direction)"
+        )
     capture = scene.capture
     if camera is None and scene.camera is not None:
         camera = capture.motion.moved(scene.camera, capture.shutter.time)
@@ -134,7 +138,10 @@ def default_radius(camera: Camera) -> float:
 def _camera_and_pixel(camera: Camera | None, pixel, ray) -> tuple[Camera, tuple[float, float]]:
     if (pixel is None) == (ray is None):
         given = "neither" if pixel is None else "both"
-        raise InputError(f"exactly one of pixel and ray must be given, got {given}; leave one out")
+        raise InputError(
+            f"exactly one of pixel and ray must be given, got {given}; give pixel=(x, y) or "
+            "ray=(origin, direction)"
+        )
     if ray is not None:
         return _ray_camera(ray), (PATCH_SIZE / 2, PATCH_SIZE / 2)
     if camera is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ from fidsplat.util.progress import Progress
 
 if TYPE_CHECKING:
     from fidsplat.markers import Marker
+    from fidsplat.render.renderer import Renderer
+    from fidsplat.render.resident import ResidentCloud
 
 
 class Scene(SceneParts, Summarised):
@@ -67,16 +70,26 @@ class Scene(SceneParts, Summarised):
         """
         write_scene(self, path)
 
-    def surface_at(self, camera: Camera | None = None, pixel: Any = None, **options: Any) -> Surface:
-        """Position and normal of the surface at a pixel, from rendered depth.
-
-        options: ray, radius, renderer, resident of `fs.surface_at`.
+    def surface_at(
+        self,
+        camera: Camera | None = None,
+        pixel: Any = None,
+        *,
+        ray: Any = None,
+        radius: float | None = None,
+        renderer: Renderer | None = None,
+        resident: ResidentCloud | None = None,
+    ) -> Surface:
+        """Position and normal of the surface at a pixel or along a ray, from rendered depth; see
+        `fs.surface_at`.
 
         Raises InputError if less than half of the patch is one plane, or the pixel is outside the image.
         """
         import fidsplat  # lazy: it imports the renderer, on which scenes do not depend
 
-        return fidsplat.surface_at(self, camera, pixel, **options)
+        return fidsplat.surface_at(
+            self, camera, pixel, ray=ray, radius=radius, renderer=renderer, resident=resident
+        )
 
     def place(
         self,
@@ -84,35 +97,49 @@ class Scene(SceneParts, Summarised):
         *,
         camera: Camera | None = None,
         pixel: Any = None,
+        ray: Any = None,
+        radius: float | None = None,
         up: Any = None,
         lift: float | None = None,
         bundle: str | None = None,
         light: Any = None,
-        **options: Any,
+        renderer: Renderer | None = None,
+        resident: ResidentCloud | None = None,
     ) -> Scene:
         """The scene with one more marker, upright on the surface at a pixel or along a ray.
 
-        On floors and ceilings, the upper edge of the marker faces the top of the image.
+        On floors and ceilings, the upper edge of the marker faces the top of the image. Warns if the scene
+        has a tag or QR code of the same content.
 
         Args:
-            marker: the marker; the patch of the surface has the size of its quiet zone, unless `radius` is
-                given.
-            camera, pixel: camera, by default the scene's, and (x, y) in its image.
+            marker: the marker.
+            camera, pixel, ray: camera, by default the scene's, and (x, y) in its image; or a ray, see
+                `fs.surface_at`.
+            radius: radius of the patch of the surface [m]; None: of the marker with its quiet zone.
             up: (3,) vertical of the scene; None: as estimated by `fidsplat info`.
             lift: distance in front of the surface [m]; None: 1 mm plus twice the roughness.
             bundle, light: see `PlacedMarker`.
-            options: ray, radius, renderer, resident of `fs.surface_at`.
+            renderer, resident: see `fs.surface_at`.
 
         Raises InputError if less than half of the patch is one plane, or the pixel is outside the image.
         """
         from fidsplat.markers import Marker  # lazy: heavy imports
 
         instance("marker", marker, Marker, "a Marker, e.g. fs.marker('apriltag:36h11:5', 0.16)")
-        surface = self.surface_at(camera, pixel, **{"radius": marker.radius} | options)
-        view = camera or self.camera
-        if options.get("ray") is not None or view is None:
-            directions = [options["ray"][1], *np.eye(3)]
+        radius = marker.radius if radius is None else radius
+        surface = self.surface_at(camera, pixel, ray=ray, radius=radius, renderer=renderer, resident=resident)
+        coded = marker.id is not None or marker.payload is not None
+        if coded and any(placed.marker.spec == marker.spec for placed in self.markers):
+            warnings.warn(
+                f"{marker.spec} is already in the scene: markers that occur more than once do not determine "
+                "a pose; place another marker, or remove the first one",
+                stacklevel=2,
+            )
+        if ray is not None:
+            directions = [ray[1], *np.eye(3)]
         else:
+            view = camera or self.camera
+            assert view is not None  # checked by surface_at
             directions = [-view.world_to_camera[1, :3], view.world_to_camera[2, :3]]
         pose = surface.pose([scene_up(self) if up is None else up, *directions], lift)
         return replace(self, markers=(*self.markers, PlacedMarker(marker, pose, bundle=bundle, light=light)))

@@ -138,6 +138,7 @@ def test_the_scenes_camera_is_at_the_time_of_the_shutter(renderer):
         ({"ray": (AT, (0.0, 0.0, 0.0))}, r"a finite non-zero direction \(3,\)"),
         ({"ray": (AT, (0.0, math.nan, 0.0))}, "ray must be a finite origin"),
         ({"ray": 3}, "ray must be an origin"),
+        ({"camera": (AT, NORMAL)}, r"camera must be a Camera, .* give a ray as ray=\(origin, direction\)"),
     ],
 )
 def test_what_has_no_surface_is_refused(renderer, arguments, words):
@@ -177,6 +178,8 @@ def test_a_marker_on_a_wall_is_upright_and_readable(wall, renderer):
     assert reading.position_error < 0.02
     turned = wall.place(tag, pixel=pixel, up=(1.0, 0.0, 0.0), renderer=renderer).markers[0].pose
     assert turned[0, 1] < -0.8
+    with pytest.warns(UserWarning, match="apriltag:36h11:5 is already in the scene.*do not determine a pose"):
+        assert len(scene.place(tag, pixel=(40.0, 60.0), renderer=renderer).markers) == 2
 
 
 @pytest.mark.parametrize("how", ["pixel", "ray"])
