@@ -88,7 +88,16 @@ class DeviceModel:
     def refine(self, refinement: ViewRefinement, views: Sequence[View]) -> None:
         """Refine the views in later steps. views: their uniforms, with the cameras of the data set."""
         self._refinement = refinement
-        self._kernels.load_refinement(refinement.arrays(), views, refinement.rows)
+        settings = {
+            name: int(getattr(self._settings, attribute))
+            for name, attribute in (
+                *(("refine_pose", "refine_poses"), ("refine_intrinsics", "refine_intrinsics")),
+                ("refine_exposure", "fit_exposures"),
+            )
+        }
+        self._kernels.load_refinement(
+            refinement.arrays(), views, refinement.rows, refinement.depths, settings
+        )
 
     def read_refinement(self) -> None:
         """Copy refined cameras and exposures to the host."""
@@ -149,20 +158,17 @@ class DeviceModel:
         self._kernels.step(by_tiles, sizes, numbers, camera is not None, refined)
 
     def _refine_intrinsics(self, by_tiles: Any, step: ViewStep) -> dict[str, Any]:
-        """Apply the due steps of the intrinsics; returns the numbers of the kernel `refine_view`."""
-        refinement, settings, view = self._refinement, self._settings, step.view
+        """Apply the due steps of the intrinsics; returns the other arguments of the kernel `refine_view`."""
+        refinement, settings = self._refinement, self._settings
         assert refinement is not None
         for row in refinement.due_intrinsics(step):
-            numbers = refinement.intrinsics_step(row, step.iteration)
-            numbers |= {"beta1": settings.beta1, "beta2": settings.beta2, "intrinsics_row": row}
-            self._kernels.refine_intrinsics(by_tiles, numbers, len(self._cameras))
+            args = {"beta1": settings.beta1, "beta2": settings.beta2, "intrinsics_row": row}
+            args["intrinsics_rate"] = refinement.intrinsics_rate(row, step.iteration)
+            self._kernels.refine_intrinsics(by_tiles, args, len(self._cameras))
         return {
-            **{"view_index": view, "next_view": step.next_view, "intrinsics_row": refinement.rows[view]},
-            **{"refine_pose": int(settings.refine_poses), "depth": refinement.depths[view]},
-            **{"refine_intrinsics": int(settings.refine_intrinsics)},
-            **{"refine_exposure": int(settings.fit_exposures)},
-            **refinement.pose_step(view, step.iteration),
-            **{f"exposure_{name}": v for name, v in refinement.exposure_step(view, step.iteration).items()},
+            **{"view_index": step.view, "next_view": step.next_view},
+            "pose_rate": refinement.pose_rate(step.view, step.iteration),
+            "exposure_rate": refinement.exposure_rate(step.view, step.iteration),
         }
 
     def centre_exposures(self) -> None:

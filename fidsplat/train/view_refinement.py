@@ -40,20 +40,19 @@ class _Adam:
         self.moments = np.zeros((rows, 2, size))
         self.steps = np.zeros(rows, np.int64)
 
-    def next_step(self, row: int, rate: float) -> dict[str, float]:
-        """Count a step of a row; returns the learning rate and the bias corrections of both moments."""
+    def next_rate(self, row: int, rate: float) -> float:
+        """Count a step of a row; returns the learning rate with the bias corrections of both moments."""
         self.steps[row] += 1
-        corrections = [1 - beta ** int(self.steps[row]) for beta in self._betas]
-        return {"rate": rate, "correction1": corrections[0], "correction2": corrections[1]}
+        step, (beta1, beta2) = int(self.steps[row]), self._betas
+        return rate * math.sqrt(1 - beta2**step) / (1 - beta1**step)
 
     def step(self, row: int, gradient: np.ndarray, rate: float) -> np.ndarray:
         """Count a step of a row; returns the change of its parameters (size,)."""
-        numbers, corrected = self.next_step(row, rate), []
-        for moment, (beta, sample) in enumerate(zip(self._betas, (gradient, gradient**2), strict=True)):
-            self.moments[row, moment] += (1 - beta) * (sample - self.moments[row, moment])
-            corrected.append(self.moments[row, moment] / numbers[f"correction{moment + 1}"])
-        mean, square = (moment.reshape(2, -1) for moment in corrected)
-        return rate * (-mean / (np.sqrt(square.mean(axis=1, keepdims=True)) + _EPSILON)).ravel()
+        rate = self.next_rate(row, rate)
+        for moment, beta, sample in zip(self.moments[row], self._betas, (gradient, gradient**2), strict=True):
+            moment += (1 - beta) * (sample - moment)
+        mean, square = self.moments[row].reshape(2, 2, -1)
+        return -rate * (mean / (np.sqrt(square.mean(axis=1, keepdims=True)) + _EPSILON)).ravel()
 
 
 class ViewStep(NamedTuple):
@@ -128,11 +127,14 @@ class ViewRefinement:
         motion[3:] += pivot - rotation_matrix(motion[:3]) @ pivot
         self.poses[view] = offset_pose(self.poses[view], motion)
 
-    def pose_step(self, view: int, iteration: int) -> dict[str, float]:
-        """Count a step of a pose on the device; returns its learning rate and bias corrections."""
-        if not self._settings.refine_poses:
-            return {"rate": 0.0, "correction1": 1.0, "correction2": 1.0}
-        return self._pose_adam.next_step(view, self._settings.pose_rate_at(iteration))
+    def pose_rate(self, view: int, iteration: int) -> float:
+        """Count a step of a pose on the device; returns its learning rate with bias corrections."""
+        settings = self._settings
+        return (
+            self._pose_adam.next_rate(view, settings.pose_rate_at(iteration))
+            if settings.refine_poses
+            else 0.0
+        )
 
     def add_intrinsics(self, view: int, by_intrinsics: np.ndarray) -> None:
         """Add a gradient (4,) of the loss of a view by its intrinsics to the sums."""
@@ -157,10 +159,10 @@ class ViewRefinement:
         self.intrinsics[row] += focal * self._intrinsics_adam.step(row, sums * focal, rate)
         sums[:] = 0
 
-    def intrinsics_step(self, row: int, iteration: int) -> dict[str, float]:
-        """Count a step of a row of the intrinsics on the device; returns its learning rate and bias
+    def intrinsics_rate(self, row: int, iteration: int) -> float:
+        """Count a step of a row of the intrinsics on the device; returns its learning rate with bias
         corrections."""
-        return self._intrinsics_adam.next_step(row, self._settings.pose_rate_at(iteration))
+        return self._intrinsics_adam.next_rate(row, self._settings.pose_rate_at(iteration))
 
     def with_intrinsics(self, camera: Camera, initial: Camera) -> Camera:
         """The camera with the refined intrinsics of the training views that had the intrinsics of `initial`;
@@ -176,11 +178,11 @@ class ViewRefinement:
         rate = self._settings.exposure_rate_at(iteration)
         self.exposures[view] += self._exposure_adam.step(view, by_exposure.ravel(), rate).reshape(2, 3)
 
-    def exposure_step(self, view: int, iteration: int) -> dict[str, float]:
-        """Count a step of an exposure on the device; returns its learning rate and bias corrections."""
+    def exposure_rate(self, view: int, iteration: int) -> float:
+        """Count a step of an exposure on the device; returns its learning rate with bias corrections."""
         if not self._settings.fit_exposures:
-            return {"rate": 0.0, "correction1": 1.0, "correction2": 1.0}
-        return self._exposure_adam.next_step(view, self._settings.exposure_rate_at(iteration))
+            return 0.0
+        return self._exposure_adam.next_rate(view, self._settings.exposure_rate_at(iteration))
 
     def centre_exposures(self) -> None:
         """Set the means of the exposures over the views to 0; the splats' colours then compensate."""

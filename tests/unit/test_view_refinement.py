@@ -174,8 +174,12 @@ def test_exposures_return_to_the_truth(renderer, cloud, original):
     assert unfitted.evaluate(exposed.views)[0].psnr < 30
 
 
-def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch):
-    """Kernels of the derivatives by camera and exposure against the float64 reference."""
+@pytest.mark.parametrize("other_schedule", [False, True])
+def test_devices_agree_on_refinement(renderer, cloud, disturbed, monkeypatch, other_schedule):
+    """Kernels of the derivatives by camera and exposure, of CPUs and GPUs, against the float64 reference."""
+    if other_schedule:
+        config = next(iter(renderer.backend.configs("schedule").values()))
+        monkeypatch.setattr(renderer.backend, "config", config)
     monkeypatch.setattr("fidsplat.train.view_refinement.INTRINSICS_EVERY", 2)
     results = []
     for device in (renderer, fs.Renderer("reference")):

@@ -29,6 +29,7 @@ from fidsplat.backends.opencl.assemble import (
 from fidsplat.backends.opencl.buffers import DeviceRecord
 from fidsplat.backends.opencl.cloud import OpenCLCloud
 from fidsplat.backends.opencl.command_list import CommandList
+from fidsplat.backends.opencl.declare import Argument
 from fidsplat.backends.opencl.device_frame import DeviceFrame
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
@@ -83,6 +84,8 @@ class OpenCLGradients(GradientPipeline):
         self._tile_commands, self.sum_commands = CommandList(self.program), CommandList(self.program)
         self.step_commands: dict[bool, CommandList] = {}
         """command lists of `TileGradients.step`, without and with refinement of views"""
+        self.frame_arguments: dict[bool, dict[str, Argument]] = {}
+        """arguments of their kernels that frames define"""
 
     def forward(self, cloud: OpenCLCloud, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """Render one frame. waits: whether to wait for its counts, as the first frame on a GPU must."""
@@ -234,36 +237,50 @@ class TileGradients:
             self._sum_gradients(frame, results, groups)
             return results
 
-    def step(self, arguments: Mapping[str, Any], next_record: DeviceRecord | None = None) -> None:
+    def step(
+        self,
+        arguments: Mapping[str, Any],
+        constants: Mapping[str, Any],
+        version: object,
+        next_record: DeviceRecord | None = None,
+    ) -> None:
         """Submit an optimiser step (kernels/opencl/project_step.cl), compiled by
         `OpenCLGradients.compile_step`.
 
-        arguments: values that the frame does not define. next_record: record of the next frame's camera, if
-            views are refined (kernels/opencl/train/refine_view.cl).
+        Args:
+            arguments: values that the frame does not define.
+            constants: more of them, which are equal in all steps of a version.
+            next_record: record of the next frame's camera, if views are refined
+                (kernels/opencl/train/refine_view.cl).
         """
         with self._latest_frame():
             refined = next_record is not None
             frame, commands = self._frame, self.pipeline.step_commands[refined]
-            count = frame.cloud.count
-            arguments = {**arguments, "count": count}
+            arguments = {**arguments, "count": (count := frame.cloud.count)}
             if refined:
                 arguments["groups"] = self._allocate_camera_sums(frame)
-            declared = commands.program.source.arguments
-            sizes = {"project_step": (max(1, -(-count // _GROUP)) * _GROUP, _GROUP)}
-            sizes |= {"refine_view": (_REFINE_ITEMS, _REFINE_ITEMS)} if refined else {}
-            values = {
-                name: arguments[name] if name in arguments else frame.argument_value(argument)
-                for kernel in sizes
-                for name, argument in declared[kernel].items()
-            }
-            if commands.key != count:
+            declared, key = commands.program.source.arguments, (count, version)
+            kernels = ("project_step", "refine_view") if refined else ("project_step",)
+            if commands.key != key:
                 commands.clear()
-                for kernel, (size, group) in sizes.items():
+                self.pipeline.frame_arguments[refined] = {
+                    name: argument
+                    for kernel in kernels
+                    for name, argument in declared[kernel].items()
+                    if name not in arguments and name not in constants
+                }
+            for name, argument in self.pipeline.frame_arguments[refined].items():
+                arguments[name] = frame.argument_value(argument)
+            if commands.key != key:
+                values, groups = {**constants, **arguments}, max(1, -(-count // _GROUP))
+                for kernel, size, group in zip(
+                    kernels, (groups * _GROUP, _REFINE_ITEMS), (_GROUP, _REFINE_ITEMS), strict=False
+                ):
                     commands.record(kernel, (size,), (group,), [values[name] for name in declared[kernel]])
-                commands.key = count
-            commands.set(values)
+                commands.key = key
+            commands.set(arguments)
             frame.events += commands.submit(frame.queue)
-            frame.stages += ["project backward"] * len(sizes)
+            frame.stages += ["project backward"] * len(kernels)
             if next_record is not None:
                 frame.pool.set_contents("view", next_record)
 

@@ -118,7 +118,7 @@ _BLEND = args(
 )
 
 _EXPOSURES = args("in float exposures  // (views, 6): logarithms of gains, and offsets")
-_VIEW_ADAM = args("real rate beta1 beta2 correction1 correction2  // correction1: 1 - beta1^step")
+_EXPOSED = args("int exposed  // whether there is an exposure", "uint view_index", _EXPOSURES)
 _LOSS_SIZE = args(
     "int width height  // width: values of a row, three per pixel",
     "int stride  // floats of an image's row",
@@ -270,10 +270,11 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float activated_quats activated_scales activated_opacities activated_sh",
     ),
     "refine_view": args(
-        "uint groups exposure_groups view_index next_view intrinsics_row",
-        *("int refine_pose refine_intrinsics refine_exposure", _VIEW_ADAM),
-        "real exposure_rate exposure_correction1 exposure_correction2",
-        "real depth  // [m] of the point about which the camera rotates",
+        "uint groups exposure_groups view_index next_view",
+        "int update refine_pose refine_intrinsics refine_exposure",
+        "real beta1 beta2 pose_rate exposure_rate  // learning rates with bias corrections",
+        "in float depths  // (views) [m] of the points about which the cameras rotate",
+        "in uint intrinsics_rows  // (views)",
         "in real camera_sums  // (groups, 10)",
         "in float exposure_sums  // (exposure_groups, 6)",
         "out View views view  // records of all views; of the frame",
@@ -282,7 +283,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float exposures",
     ),
     "refine_intrinsics": args(
-        *("uint count  // views", "uint intrinsics_row", _VIEW_ADAM),
+        *("uint count  // views", "uint intrinsics_row", "real beta1 beta2 intrinsics_rate"),
         "in uint intrinsics_rows  // (views)",
         "out real intrinsics intrinsics_sums  // (rows, 4): fx, fy, cx, cy",
         "out real intrinsics_moments  // (rows, 2, 4)",
@@ -327,15 +328,18 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     # training
     "loss_load": args(
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
-        *("int exposed", "uint view_index", _EXPOSURES, _IMAGES),
+        *(_EXPOSED, _IMAGES),
     ),
     "loss_rows": args(_LOSS_SIZE, _IMAGES),
     "loss_columns": args(_LOSS_SIZE, _IMAGES),
     "loss_rows_backward": args(_LOSS_SIZE, _IMAGES),
     "loss_columns_backward": args(
-        _LOSS_SIZE, "float l1_weight ssim_weight", _MASK, "in float images", "out float grad_rgb"
+        *(_LOSS_SIZE, "float l1_weight ssim_weight", _MASK, "in float images", _EXPOSED, "out float grad_rgb")
     ),
-    "loss_sums": args("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
+    "loss_sums": args(
+        *(_LOSS_SIZE, "in float images", "out float sums  // (work-groups, 3)"),
+        *(_EXPOSED, "in float rgb grad_rgb", "out float exposure_sums  // (work-groups, 6)"),
+    ),
     "loss_strips": args(
         *(_LOSS_SIZE, "in float rgb", "in uchar target", _MASK),
         *(_IMAGES, "out float sums  // (work-groups, 3)"),

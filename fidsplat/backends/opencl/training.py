@@ -27,7 +27,7 @@ _PANEL, _STRIP = 128, 64
 _SUM_GROUPS, _SUM_ITEMS = 512, 128
 """work-groups of the loss sums, and their work-items (SUM_ITEMS of kernels/opencl/train/loss.cl)"""
 _EXPOSURE_GROUPS, _EXPOSURE_ITEMS = 256, 96
-"""work-groups of the kernels of exposures, and their work-items (EXPOSURE_ITEMS of
+"""work-groups of the kernels of exposures on CPUs, and their work-items (EXPOSURE_ITEMS of
 kernels/opencl/train/exposure.cl)"""
 _ROWS_PER_ITEM = 4
 """rows per work-item of the vertical passes (ROWS_PER_ITEM of kernels/opencl/train/loss.cl)"""
@@ -41,15 +41,8 @@ _STEP_NUMBERS = (
     *(f"lr_{name}" for name in ("means", "scales", "quats", "logits", "sh", "rest")),
 )
 """numeric arguments of a step of Adam (kernels/opencl/project_step.cl)"""
-_NO_VIEW_STEP: dict[str, float] = dict.fromkeys(
-    (
-        *("view_index", "next_view", "intrinsics_row", "refine_pose", "refine_intrinsics", "refine_exposure"),
-        *("rate", "correction1", "correction2", "depth"),
-        *("exposure_rate", "exposure_correction1", "exposure_correction2"),
-    ),
-    0,
-)
-"""numeric arguments of the kernel `refine_view` that refine nothing"""
+_NO_VIEW_STEP = {"view_index": 0, "next_view": 0, "pose_rate": 0.0, "exposure_rate": 0.0}
+"""arguments of the kernel `refine_view` without an update"""
 
 
 class _Target(NamedTuple):
@@ -163,7 +156,8 @@ class OpenCLTraining:
         """Copy the images to the device: (h, w, 3) uint8 each, with a mask (h, w) bool or None. intrinsics:
         (views, 4) fx, fy, cx, cy."""
         self._bound["lenses"] = self._upload("intrinsics", intrinsics.astype(np.float32))
-        self._bound["exposures"] = self._bound["lenses"]  # read only if there are exposures
+        # used only if there are exposures
+        self._bound["exposures"] = self._bound["exposure_sums"] = self._bound["lenses"]
         for image, mask in views:
             weights = np.zeros(1, np.uint8) if mask is None else mask.astype(np.uint8)
             values = image.size if mask is None else max(1, 3 * int(weights.sum()))
@@ -288,19 +282,20 @@ class OpenCLTraining:
                 **{"images": self._allocate_images(height, columns)},
                 "image_stride": stride * (height + 2 * _MARGIN_ROWS),
             }
-            exposures = (_EXPOSURE_GROUPS * _EXPOSURE_ITEMS,), (_EXPOSURE_ITEMS,), values
-            backward = [self._launch_of("exposure_backward", *exposures)] if exposed else []
             if in_strips:
                 kernels = "loss_strips", "loss_strips_backward"
-                strips = [self._launch_of(kernel, grid, (1, 1), values) for kernel in kernels]
-                applied = [self._launch_of("apply_exposure", *exposures)] if exposed else []
-                return [*applied, *strips, *backward]
+                launches = [self._launch_of(kernel, grid, (1, 1), values) for kernel in kernels]
+                if exposed:
+                    sizes = (_EXPOSURE_GROUPS * _EXPOSURE_ITEMS,), (_EXPOSURE_ITEMS,), values
+                    launches.insert(0, self._launch_of("apply_exposure", *sizes))
+                    launches.append(self._launch_of("exposure_backward", *sizes))
+                return launches
             launches = [self._row_launch("loss_load", 3 * columns, values, height)]
             for kernel in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
                 rows = -(-height // _ROWS_PER_ITEM) if "columns" in kernel else height
                 launches.append(self._row_launch(kernel, 3 * columns, values, rows))
             items = (_SUM_GROUPS * _SUM_ITEMS,)
-            return [*launches, *backward, self._launch_of("loss_sums", items, (_SUM_ITEMS,), values)]
+            return [*launches, self._launch_of("loss_sums", items, (_SUM_ITEMS,), values)]
 
         events = self._replay("loss", (height, columns, dssim_weight, exposed), args, loss_launches)
         readback.submitted(slot, events[int(exposed) if in_strips else -1])
@@ -370,20 +365,33 @@ class OpenCLTraining:
         # compiling takes seconds: it is first, so that an interrupt leaves the statistics unchanged
         gradients.pipeline.compile_step(view_step is not None)
         if view_step is None or self._refinement is None:
-            gradients.step({**self._bound, **args})
+            gradients.step(args, self._bound, self._version)
             return
         next_record = self._refinement.device_records[view_step["next_view"]]
-        gradients.step({**self._bound, **args, **view_step}, next_record)
+        gradients.step({**args, **view_step}, self._bound, self._version, next_record)
 
     def load_refinement(
-        self, arrays: Mapping[str, np.ndarray], views: Sequence[View], rows: Sequence[int]
+        self,
+        arrays: Mapping[str, np.ndarray],
+        views: Sequence[View],
+        rows: Sequence[int],
+        depths: Sequence[float],
+        settings: Mapping[str, Any],
     ) -> None:
-        """Copy the state of `ViewRefinement` to the device. views: uniforms of the training views. rows: row
-        of `intrinsics` of each view."""
+        """Copy the state of `ViewRefinement` to the device.
+
+        Args:
+            views: uniforms of the training views.
+            rows: row of `intrinsics` of each view.
+            depths: depth of the point about which each camera rotates.
+            settings: arguments of the kernel `refine_view` that are equal in all steps.
+        """
         self._refinement = OpenCLViewRefinement(self._workspace, arrays, views, rows, self._bound)
-        size = 24 * _EXPOSURE_GROUPS
-        self._bound["exposure_sums"] = self._workspace.pool.allocate("the exposures' sums", size)
-        self._bound["exposure_groups"] = _EXPOSURE_GROUPS
+        groups = _EXPOSURE_GROUPS if self._lanes > 1 else _SUM_GROUPS
+        sums = self._workspace.pool.allocate("the exposures' sums", 24 * groups)
+        depth_buffer = self._upload("the views' depths", np.array(depths, np.float32))
+        self._bound |= {"exposure_groups": groups, "exposure_sums": sums, "depths": depth_buffer, **settings}
+        self._version = object()
 
     def read_refinement(self) -> dict[str, np.ndarray]:
         """Copy the state of `ViewRefinement` to the host; waits for the device."""

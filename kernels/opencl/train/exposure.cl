@@ -1,4 +1,4 @@
-// Exposure of a view: a gain and an offset of each channel between the render and the loss. NumPy version: fidsplat/train/losses.py.
+// Exposure of a view: a gain and an offset of each channel between the render and the loss; on GPUs in loss.cl. NumPy version: fidsplat/train/losses.py.
 #define EXPOSURE_ITEMS 96   // a multiple of three: each work-item has the values of one channel
 
 // Declares channel, gain and offset of a work-item, and the values of its work-group, a contiguous range of pixels.
@@ -7,8 +7,7 @@
     uint first = get_group_id(0) * piece, end = min(first + piece, 3 * pixels); \
     float gain = exp(exposures[6 * view_index + channel]), offset = exposures[6 * view_index + 3 + channel]
 
-// Index space: any number of work-groups of EXPOSURE_ITEMS. Reads: the render. Writes: the exposed render. For CPUs; on GPUs loss_load applies the
-// exposure.
+// Index space: any number of work-groups of EXPOSURE_ITEMS. Reads: the render. Writes: the exposed render.
 kernel __attribute__((reqd_work_group_size(EXPOSURE_ITEMS, 1, 1))) void apply_exposure(
 //@@ arguments apply_exposure
 ) {

@@ -9,6 +9,9 @@
     if (column >= width || row >= height) return; \
     size_t at = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column
 
+// Gain of a channel.
+#define GAIN(channel) exp(exposures[6 * view_index + (channel)])
+
 // Index space: one work-item per value of the image. Reads: the render, to which an exposure is applied if `exposed`, the target, the mask. Writes: images
 // 0 and 1 of `images`. Where the mask is 0 the render is replaced by the target.
 kernel void loss_load(
@@ -20,7 +23,7 @@ kernel void loss_load(
     float target_value = target[from] * (1.0f / 255);
     bool counts = !masked || mask[(size_t)row * (width / 3) + column / 3];
     float value = rgb[from];
-    if (exposed) value = exp(exposures[6 * view_index + column % 3]) * value + exposures[6 * view_index + 3 + column % 3];
+    if (exposed) value = GAIN(column % 3) * value + exposures[6 * view_index + 3 + column % 3];
     images[to] = counts ? value : target_value;
     images[image_stride + to] = target_value;
 }
@@ -100,7 +103,8 @@ kernel void loss_rows_backward(
     VSTORE(INSIDE(grad_shared), images + 4 * image_stride + at);
 }
 
-// Index space: (LANES values, ROWS_PER_ITEM rows). Reads: images 0 to 4. Writes: the gradient of the loss, in the shape of the image.
+// Index space: (LANES values, ROWS_PER_ITEM rows). Reads: images 0 to 4. Writes: the gradient of the loss with respect to the render, in the shape of
+// the image.
 kernel void loss_columns_backward(
 //@@ arguments loss_columns_backward
 ) {
@@ -115,20 +119,22 @@ kernel void loss_columns_backward(
         VSTORE(slope, values);
         for (int k = 0; k < LANES && column + k < width; k++) {
             bool counts = !masked || mask[(size_t)row * (width / 3) + (column + k) / 3];
-            grad_rgb[(size_t)row * width + column + k] = counts ? values[k] : 0.0f;
+            float gain = exposed ? GAIN((column + k) % 3) : 1.0f;
+            grad_rgb[(size_t)row * width + column + k] = counts ? gain * values[k] : 0.0f;
         }
     }
 }
 
-// Index space: any number of work-groups of SUM_ITEMS. Reads: images 0, 1 and 10, zero margins included. Writes: each work-group's
-// sums of |a - b|, (a - b)^2 and the SSIM, in a fixed order (deterministic). A group sums a contiguous range of the images, for
-// locality on CPUs.
+// Index space: any number of work-groups of SUM_ITEMS. Reads: images 0, 1 and 10, zero margins included; if `exposed`, the render and its gradient.
+// Writes: each work-group's sums of |a - b|, (a - b)^2 and the SSIM, and of the gradients with respect to the logarithms of the gains and the
+// offsets, in a fixed order (deterministic). A group sums a contiguous range of the images.
 #define SUM_ITEMS 128
 kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void loss_sums(
 //@@ arguments loss_sums
 ) {
-    local real partial[3][SUM_ITEMS];
-    uint item = get_local_id(0);
+    local real partial[9][SUM_ITEMS];
+    uint item = get_local_id(0), columns = exposed ? 9 : 3;
+    real by_gain[3] = {0}, by_offset[3] = {0};
     real absolute = 0, squared = 0, ssim = 0;
     size_t piece = (image_stride + get_num_groups(0) - 1) / get_num_groups(0), first = get_group_id(0) * piece;
     for (size_t at = first + item; at < min(first + piece, (size_t)image_stride); at += SUM_ITEMS) {
@@ -136,14 +142,31 @@ kernel __attribute__((reqd_work_group_size(SUM_ITEMS, 1, 1))) void loss_sums(
         absolute += fabs(difference);
         squared += difference * difference;
         ssim += images[10 * image_stride + at];
+        if (!exposed) continue;
+        int row = (int)(at / stride) - MARGIN_ROWS, column = (int)(at % stride) - MARGIN;
+        if (row < 0 || row >= height || column < 0 || column >= width) continue;
+        size_t pixel_value = (size_t)row * width + column;
+        // outside of the mask the gradient is 0, and the render may not be finite
+        float slope = grad_rgb[pixel_value], by_log_gain = slope == 0.0f ? 0.0f : slope * rgb[pixel_value];
+#pragma unroll
+        for (int channel = 0; channel < 3; channel++) {
+            by_gain[channel] += column % 3 == channel ? by_log_gain : 0.0f;
+            by_offset[channel] += column % 3 == channel ? slope : 0.0f;
+        }
     }
     partial[0][item] = absolute;
     partial[1][item] = squared;
     partial[2][item] = ssim;
+    if (exposed)
+        for (int channel = 0; channel < 3; channel++) {
+            partial[3 + channel][item] = by_gain[channel];
+            partial[6 + channel][item] = by_offset[channel] / GAIN(channel);   // `grad_rgb` has the gain as a factor
+        }
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item < 3) {
+    if (item < columns) {
         real sum = 0;
         for (uint other = 0; other < SUM_ITEMS; other++) sum += partial[item][other];
-        sums[3 * get_group_id(0) + item] = (float)sum;
+        if (item < 3) sums[3 * get_group_id(0) + item] = (float)sum;
+        else exposure_sums[6 * get_group_id(0) + item - 3] = (float)sum;
     }
 }

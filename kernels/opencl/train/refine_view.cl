@@ -5,15 +5,14 @@
 
 // Step of a pose. camera: the record View of the view. gradient: with respect to rotation and translation of the camera.
 static inline void refine_pose_of(
-    global View *camera, local const real *gradient, real depth, global real *moments, real rate, real beta1, real beta2, real correction1,
-    real correction2
+    global View *camera, local const real *gradient, real depth, global real *moments, real beta1, real beta2, real rate
 ) {
     // rotation about the point at `depth` on the optical axis, and translation in units of the depth
     real by_pose[6] = {gradient[0] + depth * gradient[4], gradient[1] - depth * gradient[3], gradient[2],
                        depth * gradient[3], depth * gradient[4], depth * gradient[5]};
     real motion[6], pose[12], rotation[9];
-    view_adam(by_pose, 3, moments, beta1, beta2, correction1, correction2, motion);
-    for (int k = 0; k < 6; k++) motion[k] *= k < 3 ? rate : rate * depth;
+    view_adam(by_pose, 3, moments, beta1, beta2, rate, motion);
+    for (int k = 3; k < 6; k++) motion[k] *= depth;
     // the rotation about the camera moves that point; move it back
     rotation_of(motion, rotation);
     for (int k = 0; k < 3; k++) motion[3 + k] -= depth * (rotation[3 * k + 2] - (k == 2));
@@ -34,9 +33,9 @@ static inline void column_sums(real sum, uint columns, local real *partial, loca
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// Index space: one work-group of REFINE_ITEMS. Reads: the sums of the work-groups of project_step and exposure_backward. Updates, by the flags `refine_*`:
-// pose, sums of the gradients with respect to the intrinsics, and exposure of a view, with their moments. Writes: `view`, the record of the next
-// frame, which then need not be copied.
+// Index space: one work-group of REFINE_ITEMS. Reads: the sums of the work-groups of project_step, and of exposure_backward or loss_sums. Updates, if
+// `update`, by the flags `refine_*`: pose, sums of the gradients with respect to the intrinsics, and exposure of a view, with their moments.
+// Writes: `view`, the record of the next frame, which then need not be copied.
 kernel __attribute__((reqd_work_group_size(REFINE_ITEMS, 1, 1))) void refine_view(
 //@@ arguments refine_view
 ) {
@@ -48,15 +47,15 @@ kernel __attribute__((reqd_work_group_size(REFINE_ITEMS, 1, 1))) void refine_vie
     if (refine_exposure)
         for (uint k = item; k < 6 * exposure_groups; k += REFINE_ITEMS) exposure_sum += exposure_sums[k];
     column_sums(exposure_sum, 6, partial, by_exposure);
-    if (item == 0 && refine_pose)
-        refine_pose_of(views + view_index, by_camera, depth, pose_moments + 12 * view_index, rate, beta1, beta2, correction1, correction2);
-    if (item == 0 && refine_intrinsics)
-        for (uint k = 0; k < 4; k++) intrinsics_sums[4 * intrinsics_row + k] += by_camera[6 + k];
-    if (item == 0 && refine_exposure) {
-        real gradient[6], direction[6];
+    if (item == 0 && update && refine_pose)
+        refine_pose_of(views + view_index, by_camera, depths[view_index], pose_moments + 12 * view_index, beta1, beta2, pose_rate);
+    if (item == 0 && update && refine_intrinsics)
+        for (uint k = 0; k < 4; k++) intrinsics_sums[4 * intrinsics_rows[view_index] + k] += by_camera[6 + k];
+    if (item == 0 && update && refine_exposure) {
+        real gradient[6], change[6];
         for (uint k = 0; k < 6; k++) gradient[k] = by_exposure[k];
-        view_adam(gradient, 3, exposure_moments + 12 * view_index, beta1, beta2, exposure_correction1, exposure_correction2, direction);
-        for (uint k = 0; k < 6; k++) exposures[6 * view_index + k] += (float)(exposure_rate * direction[k]);
+        view_adam(gradient, 3, exposure_moments + 12 * view_index, beta1, beta2, exposure_rate, change);
+        for (uint k = 0; k < 6; k++) exposures[6 * view_index + k] += (float)change[k];
     }
     barrier(CLK_GLOBAL_MEM_FENCE);
     for (uint k = item; k < sizeof(View) / sizeof(real); k += REFINE_ITEMS) ((global real *)view)[k] = ((global const real *)(views + next_view))[k];
@@ -71,11 +70,11 @@ kernel __attribute__((reqd_work_group_size(INTRINSICS_ITEMS, 1, 1))) void refine
     local real values[4];
     if (get_local_id(0) == 0) {
         global real *current = intrinsics + 4 * intrinsics_row, *sums = intrinsics_sums + 4 * intrinsics_row;
-        real focal[2] = {current[0], current[1]}, gradient[4], direction[4];
+        real focal[2] = {current[0], current[1]}, gradient[4], change[4];
         for (int k = 0; k < 4; k++) gradient[k] = sums[k] * focal[k % 2];
-        view_adam(gradient, 2, intrinsics_moments + 8 * intrinsics_row, beta1, beta2, correction1, correction2, direction);
+        view_adam(gradient, 2, intrinsics_moments + 8 * intrinsics_row, beta1, beta2, intrinsics_rate, change);
         for (int k = 0; k < 4; k++) {
-            values[k] = current[k] += rate * focal[k % 2] * direction[k];
+            values[k] = current[k] += focal[k % 2] * change[k];
             sums[k] = 0;
         }
     }
