@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
+from fidsplat.cameras.pose_offset import offset_pose
+from fidsplat.capture.capture import Capture
+from fidsplat.util.errors import InputError
+
+if TYPE_CHECKING:
+    from fidsplat.backends.interface import Backend
 
 BINS, SHIFT, FIRST_BIN = 256, 19, 113 << 4
 """bins of the histograms of gradient magnitudes and residuals, positive float32: 16 per octave from 2^-14 to
@@ -56,21 +63,27 @@ class Estimate(NamedTuple):
     """standard deviation of the residuals of a channel; 0: the exposure is unknown"""
 
 
-class RenderedScene(Protocol):
-    """A scene on a device."""
+@dataclass(frozen=True, eq=False)
+class RenderedScene:
+    """A scene that is rendered for alignment."""
 
-    @property
-    def key(self) -> tuple[Any, Any]:
-        """Resident cloud and capture: the key under which command lists of frames are cached."""
-        ...
+    backend: Backend
+    splats: Any
+    """the cloud, for `prepare`"""
+    cloud: Any
+    """the cloud on the device"""
+    capture: Capture
+    """with the outputs rgb and depth"""
+    render_capture: Callable[[Capture], Any]
 
     def render(self, camera: Camera) -> Any:
         """Frame with rgb and depth of a camera."""
-        ...
+        return self.render_capture(self.capture.with_(camera=camera))
 
-    def prepared(self, camera: Camera) -> tuple[Any, Any, Any, np.ndarray]:
-        """Pipeline, resident cloud, view and origin (3,) of the frame of a camera."""
-        ...
+    def prepared(self, camera: Camera) -> tuple[Any, Any, np.ndarray]:
+        """Pipeline, view and origin (3,) of the frame of a camera."""
+        features, view = prepare(self.splats, self.capture.with_(camera=camera))
+        return self.backend.pipeline(features, self.backend.frame_config(view)), view, self.splats.origin
 
 
 class PerturbedFrame(NamedTuple):
@@ -119,10 +132,25 @@ class AlignmentSums:
     """standard deviation of the residuals of a channel"""
 
 
+class Score(NamedTuple):
+    """Sums at a pose, and derivatives of the score: of the gradient of the loss."""
+
+    sums: AlignmentSums
+    derivatives: dict[int, np.ndarray]
+    """`AlignmentSums.rhs` of the perturbed frames, by the axis of the motion: 0 to 2 rotations, 3 to 5
+    translations"""
+
+
 HUBER, TUKEY = 1.5, 4.685
 """robust thresholds in standard deviations of the noise"""
 MIN_NOISE, MAX_NOISE = 1e-2, 0.03
 """limits of the noise, display values; residuals above TUKEY * MAX_NOISE never fit"""
+DAMPING = 1e-3
+"""initial damping of Levenberg-Marquardt, relative to the diagonal"""
+DIFFERENCE = 0.01
+"""motion in pixels of the finite differences"""
+STEP = -1
+"""value instead of an axis: the next pose is that of a step of Levenberg-Marquardt (alignment_step.cl)"""
 MIN_GAIN, MAX_GAIN = 0.05, 20.0
 """limits of the gain of the image relative to the render"""
 _MEDIAN = {1: 0.4549, 3: 2.3660}
@@ -147,17 +175,38 @@ class AlignmentKernels(ABC):
     @abstractmethod
     def load(
         self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
-    ) -> list[int]:
-        """Prepare an image (h, w, 1 or 3), float32 display values, for all stages of alignment and a
-        scene; returns the number of pixels of each. A stage uses about `max_pixels` pixels, those with the
-        largest gradients."""
+    ) -> None:
+        """Prepare an image (h, w, 1 or 3), uint8 or float32 display values, for all stages of alignment, from
+        coarse to fine, and a scene. A stage uses about `max_pixels` pixels, those with the largest
+        gradients."""
+
+    @property
+    @abstractmethod
+    def pixels(self) -> list[int]:
+        """Number of used pixels of each stage; waits for the device."""
+
+    @property
+    @abstractmethod
+    def noise(self) -> float:
+        """Standard deviation of the noise of the image at the last stage, from the median of the second
+        differences along every eighth row; waits for the device."""
+
+    def check_pixels(self) -> None:
+        """Raise InputError if a stage uses no pixel; waits for the device."""
+        for stage, pixels in zip(self._stages, self.pixels, strict=True):
+            if not pixels:
+                raise InputError(
+                    "localisation must have pixels away from the border and from ignored pixels, got none at "
+                    f"{stage.camera.width} x {stage.camera.height}; give a larger image or a mask that "
+                    "ignores less"
+                )
 
     def release_scene(self) -> None:
         """Release the cloud of `load`, after the last `sums`."""
         del self._scene
 
-    def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
-        """Frame of the scene at a pose, valid until the next frame with this value of `perturbed`."""
+    def frame(self, stage: int, pose: np.ndarray) -> Any:
+        """Frame of the scene at a pose."""
         return self._scene.render(self._stages[stage].camera.with_pose(pose))
 
     @abstractmethod
@@ -171,23 +220,43 @@ class AlignmentKernels(ABC):
     ) -> AlignmentSums:
         """Sums of a stage for a frame. blocks: whether to sum each block too."""
 
-    def derivatives(
-        self, stage: int, frame: Any, fit: AlignmentFit, motions: Sequence[tuple[np.ndarray, float, int]]
-    ) -> list[np.ndarray]:
-        """`AlignmentSums.rhs` of each motion. motions: pose after the motion, and size and axis as in
-        PerturbedFrame."""
-        frames = (PerturbedFrame(self.frame(stage, pose, True), size, axis) for pose, size, axis in motions)
-        return [self.sums(stage, frame, fit, perturbed=perturbed).rhs for perturbed in frames]
+    def block_sums(self, stage: int, at: Estimate) -> AlignmentSums:
+        """Sums of each block at a pose."""
+        return self.sums(stage, self.frame(stage, at.pose), at.fit, blocks=True)
+
+    def score(self, stage: int, at: Estimate) -> Score:
+        """Score at a pose, with derivatives by finite differences of frames."""
+        frame, derivatives = self.frame(stage, at.pose), {}
+        sums = self.sums(stage, frame, at.fit, blocks=True)
+        for axis in self.axes(stage):
+            motion, size = np.zeros(6), self.motion_size(stage, axis, sums)
+            motion[axis] = size
+            perturbed = PerturbedFrame(self.frame(stage, offset_pose(at.pose, motion)), size, axis % 3)
+            fit = at.fit._replace(noise=sums.noise)
+            derivatives[axis] = self.sums(stage, frame, fit, perturbed=perturbed).rhs
+        return Score(sums, derivatives)
+
+    def axes(self, stage: int) -> tuple[int, ...]:
+        """Axes of the motions of `score`. A motion along the ray of a pixel and a rotation about it do not
+        change the pixel, so that the derivatives by z follow from those by x and y behind a pinhole."""
+        return (0, 1, 3, 4) if self._stages[stage].camera.lens is None else tuple(range(6))
+
+    def motion_size(self, stage: int, axis: int, sums: AlignmentSums) -> float:
+        """Size of a motion of `score` [rad or m]."""
+        camera = self._stages[stage].camera
+        angle = DIFFERENCE / max(camera.fx, camera.fy)
+        return angle if axis < 3 else angle / max(sums.inverse_depth**0.5, 1e-3)
 
     def minimise(
-        self, stage: int, at: Estimate, steps: int, tolerance: float, damping: float
-    ) -> Estimate | None:
-        """Minimise Huber's loss by at most `steps` iterations of Levenberg-Marquardt on the device; None on
-        devices without it.
+        self, at: Estimate, steps: Sequence[tuple[int, int]], last: int | None, tolerance: float
+    ) -> tuple[Estimate, Score | None] | None:
+        """Minimise Huber's loss by Levenberg-Marquardt on the device, without waiting between the frames;
+        None on devices without it.
 
         at: start.
-        tolerance: motion in pixels below which the stage has converged.
-        damping: initial damping, relative to the diagonal.
+        steps: stages, with their maximum numbers of steps.
+        last: stage of the score of Tukey's loss that is computed afterwards; None: no score.
+        tolerance: motion in pixels below which a stage has converged.
         """
         return None
 
@@ -202,3 +271,8 @@ def lowest_bin(counts: np.ndarray, max_pixels: int) -> int:
     """Lowest bin to use, so that it and the higher bins contain about `max_pixels` values of a histogram."""
     at_least = np.cumsum(counts[:0:-1])[::-1]
     return 1 + int(np.flatnonzero(at_least >= min(max_pixels, at_least[0]))[-1])
+
+
+def noise_of(median: float) -> float:
+    """Standard deviation of the noise of an image, from the median of its second differences."""
+    return median / (0.6745 * 1.5**0.5)

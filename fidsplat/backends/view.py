@@ -143,8 +143,6 @@ class View:
                 return math.inf, math.inf, 0.0, 0.0
             case "ray":
                 return self.focal_x, self.focal_y, self.center_x, self.center_y
-            case "rotation":
-                return tuple(self.rotation.ravel().tolist())
             case "gradient" if isinstance(environment, Gradient):
                 up = np.array(environment.up) / np.linalg.norm(environment.up)
                 return (*environment.top, *environment.bottom, *up.tolist())

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.alignment import (
+    DAMPING,
     MAX_GAIN,
     MIN_GAIN,
     MIN_NOISE,
@@ -28,11 +29,12 @@ from fidsplat.backends.alignment import (
     AlignmentSums,
     CoarseToFineStage,
     Estimate,
+    RenderedScene,
+    Score,
 )
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_pose
-from fidsplat.localisation.normal_equations import Source
-from fidsplat.util.errors import InputError
+from fidsplat.localisation.normal_equations import kernels_for
 from fidsplat.vision.pyramid import resized, smoothed, taps_of
 
 MAX_PIXELS = 20_000
@@ -59,8 +61,6 @@ _QUARTILE = 1.1
 """third quartile of the reduced chi-squared of blocks with noise alone"""
 MIN_INFORMATION = 1e-9
 """smallest eigenvalue of the scaled information matrix of a determined pose"""
-_DAMPING = 1e-3
-"""initial damping of Levenberg-Marquardt, relative to the diagonal"""
 _SETTLED = 0.3
 """motion in pixels of a step that ends a stage"""
 _REPEATED, _REPEATED_PIXELS = 4.0, 0.01
@@ -72,8 +72,6 @@ _LAST_STEPS = 6
 """maximum number of last steps"""
 _FULL_STEPS, _FULL_SETTLED = 12, 0.01
 """maximum number of steps with Huber's loss at full size, and motion in pixels that ends them"""
-_DIFFERENCE = 0.01
-"""motion in pixels of the finite differences"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +126,14 @@ def align(
     image: np.ndarray,
     mask: np.ndarray | None,
     start: Camera,
-    scene: Source,
+    scene: RenderedScene,
     coarse: bool = False,
     max_side: int = MAX_SIDE,
 ) -> Alignment:
     """Align a render of the scene with an image.
 
     Args:
-        image: (h, w, 3) or (h, w, 1) float32 display values.
+        image: (h, w, 3) or (h, w, 1), uint8 or float32 display values.
         mask: (h, w) bool, False for ignored pixels.
         start: camera of the image at its assumed pose.
         scene: the scene.
@@ -144,39 +142,23 @@ def align(
     """
     shrink = max(1.0, max(start.width, start.height) / max_side)
     finest = start.resampled(max(1, round(start.width / shrink)), max(1, round(start.height / shrink)))
-    image = resized(image, finest.width, finest.height)
     stages = stages_of(finest, mask)[: COARSE if coarse else None]
-    kernels = scene.kernels()
+    kernels, channels = kernels_for(scene), image.shape[2]
+    at = Estimate(start.world_to_camera, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
     with kernels.lock:
-        counts = kernels.load(image, [stage for stage, _ in stages], MAX_PIXELS, scene)
+        kernels.load(image, [stage for stage, _ in stages], MAX_PIXELS, scene)
         try:
-            if not all(counts):
-                camera = stages[counts.index(0)][0].camera
-                raise InputError(
-                    "localisation must have pixels away from the border and from ignored pixels, got none at "
-                    f"{camera.width} x {camera.height}; give a larger image or a mask that ignores less"
-                )
-            found = _align(image, finest, kernels, stages, coarse)
+            all_stages = [_Stage(number, stage.camera, kernels) for number, (stage, _) in enumerate(stages)]
+            limits = [(stage, steps) for stage, (_, steps) in zip(all_stages, stages, strict=True) if steps]
+            at, score = _minimise(at, limits, None if coarse else all_stages[-1])
+            if score is None:
+                fit = at.fit
+                found = Alignment(start.with_pose(at.pose), np.full((6, 6), np.nan), 0.0, at.noise, fit.gain)
+            else:
+                found = _finish(at, score, all_stages[-1])
         finally:
             kernels.release_scene()
     return replace(found, camera=start.with_pose(found.camera.world_to_camera))
-
-
-def _align(
-    image: np.ndarray,
-    start: Camera,
-    kernels: AlignmentKernels,
-    stages: list[tuple[CoarseToFineStage, int]],
-    coarse: bool,
-) -> Alignment:
-    channels = image.shape[2]
-    at = Estimate(start.world_to_camera, AlignmentFit(np.ones(channels), np.zeros(channels), huber=True))
-    for number, (stage, steps) in enumerate(stages):
-        if steps:
-            at = _minimise(at, _Stage(number, stage.camera, kernels), steps)
-    if coarse:
-        return Alignment(start.with_pose(at.pose), np.full((6, 6), np.nan), 0.0, at.noise, at.fit.gain)
-    return _finish(at, _Stage(len(stages) - 1, start, kernels, image_noise(image)))
 
 
 def _moved(at: Estimate, sums: AlignmentSums, step: np.ndarray) -> Estimate:
@@ -193,15 +175,10 @@ class _Stage:
     number: int
     camera: Camera
     kernels: AlignmentKernels
-    image_noise: float = 0.0
 
-    def frame(self, pose: np.ndarray) -> Any:
-        """Render the stage's frame at a pose (4, 4)."""
-        return self.kernels.frame(self.number, pose)
-
-    def sums(self, frame: Any, at: Estimate, noise: float = 0.0, **options: Any) -> AlignmentSums:
+    def sums(self, frame: Any, at: Estimate, noise: float = 0.0) -> AlignmentSums:
         """Sums over the pixels of the stage."""
-        return self.kernels.sums(self.number, frame, at.fit._replace(noise=noise), **options)
+        return self.kernels.sums(self.number, frame, at.fit._replace(noise=noise))
 
     def pixels(self, motion: np.ndarray, sums: AlignmentSums) -> float:
         """Approximate displacement of pixels by a motion (6,) of the camera."""
@@ -209,20 +186,38 @@ class _Stage:
         return max(self.camera.fx, self.camera.fy) * math.sqrt(turn + shift * sums.inverse_depth)
 
 
-def _minimise(at: Estimate, stage: _Stage, steps: int, settled: float = _SETTLED) -> Estimate:
-    """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
-    if (found := stage.kernels.minimise(stage.number, at, steps, settled, _DAMPING)) is not None:
+def _minimise(
+    at: Estimate, stages: list[tuple[_Stage, int]], last: _Stage | None, settled: float = _SETTLED
+) -> tuple[Estimate, Score | None]:
+    """Levenberg-Marquardt at some stages, with maximum numbers of steps; returns the estimate and its score
+    at the stage `last`, if there is one."""
+    kernels = stages[0][0].kernels
+    limits, number = [(stage.number, steps) for stage, steps in stages], None if last is None else last.number
+    found = kernels.minimise(at, limits, number, settled)
+    kernels.check_pixels()
+    if found is not None:
         return found
-    damping, frame = _DAMPING, stage.frame(at.pose)
+    for stage, steps in stages:
+        at = _minimise_stage(at, stage, steps, settled)
+    if number is None:
+        return at, None
+    tukey = at._replace(fit=at.fit._replace(huber=False, noise=0.0))
+    return at, kernels.score(number, tukey)
+
+
+def _minimise_stage(at: Estimate, stage: _Stage, steps: int, settled: float) -> Estimate:
+    """Levenberg-Marquardt at one stage. The last step is not checked by a render."""
+    frame, damping = stage.kernels.frame, DAMPING
+    first = frame(stage.number, at.pose)
     if not at.noise:  # the exposure is unknown
-        at = _moved(at, stage.sums(frame, at), np.zeros(6))
-    sums = stage.sums(frame, at)
+        at = _moved(at, stage.sums(first, at), np.zeros(6))
+    sums = stage.sums(first, at)
     for number in range(steps):
         step = _solved(sums, damping)
         tried, size = _moved(at, sums, step), stage.pixels(step[:6], sums)
         if size < settled or number == steps - 1:
             return tried
-        candidate = stage.sums(stage.frame(tried.pose), tried, sums.noise)
+        candidate = stage.sums(frame(stage.number, tried.pose), tried, sums.noise)
         if candidate.cost_before <= sums.cost:
             at, sums, damping = tried, candidate, max(damping / 10, 1e-6)
         else:
@@ -230,28 +225,32 @@ def _minimise(at: Estimate, stage: _Stage, steps: int, settled: float = _SETTLED
     return at
 
 
-def _finish(at: Estimate, stage: _Stage) -> Alignment:
+def _finish(at: Estimate, score: Score, stage: _Stage) -> Alignment:
     """Run the last steps; if they do not converge, run them again after steps with Huber's loss. Tukey's loss
     is not convex, and ignores edges displaced by more than a fraction of a pixel."""
-    alignment, settled = _last_steps(at, stage)
-    return alignment if settled else _last_steps(_minimise(at, stage, _FULL_STEPS, _FULL_SETTLED), stage)[0]
+    alignment, settled = _last_steps(at, score, stage)
+    if settled:
+        return alignment
+    at, again = _minimise(at, [(stage, _FULL_STEPS)], stage, _FULL_SETTLED)
+    assert again is not None
+    return _last_steps(at, again, stage)[0]
 
 
-def _last_steps(at: Estimate, stage: _Stage) -> tuple[Alignment, bool]:
+def _last_steps(at: Estimate, score: Score, stage: _Stage) -> tuple[Alignment, bool]:
     """Minimise Tukey's loss by Newton's method with a line search. Returns the alignment, with an infinite
     covariance if the pixels do not determine it, and whether all steps decreased the loss and converged. The
-    derivative of the score is computed at the first step only."""
-    at, best, settled, rejected = Estimate(at.pose, at.fit._replace(huber=False)), None, False, False
-    step, inverse = np.zeros(6 + 2 * len(at.fit.gain)), None
-    for _ in range(_LAST_STEPS):
-        frame = stage.frame(at.pose)
-        sums = stage.sums(frame, at, 0.0 if best is None else best[1].noise, blocks=True)
-        if best is None:
-            inverse = _inverse(sums, _bread(at, sums, stage, frame))
-        elif sums.cost_before > _INCREASE * best[1].cost:
-            step, rejected = step / 4, True
-            at = _moved(best[0], best[1], step)
-            continue
+    derivative of the score is that of the first step."""
+    at, sums = Estimate(at.pose, at.fit._replace(huber=False)), score.sums
+    inverse, best, settled, rejected = _inverse(sums, _bread(score)), (at, sums), False, False
+    step = np.zeros(6 + 2 * len(at.fit.gain))
+    for number in range(_LAST_STEPS):
+        if number:
+            fit = at.fit._replace(noise=best[1].noise)
+            sums = stage.kernels.block_sums(stage.number, at._replace(fit=fit))
+            if sums.cost_before > _INCREASE * best[1].cost:
+                step, rejected = step / 4, True
+                at = _moved(best[0], best[1], step)
+                continue
         best = at, sums
         if settled := inverse is None:
             break
@@ -261,10 +260,9 @@ def _last_steps(at: Estimate, stage: _Stage) -> tuple[Alignment, bool]:
         exact = sums.noise > 1.001 * MIN_NOISE or stage.pixels(step[:6], sums) < _REPEATED_PIXELS
         if settled := square < _REPEATED**2 and exact:
             break
-    assert best is not None
-    sums = best[1]
+    sums, image_noise = best[1], max(stage.kernels.noise, MIN_IMAGE_NOISE)
     covariance = np.diag(np.full(6, np.inf)) if inverse is None else _covariance(sums, inverse)
-    inliers, excess = _agreement(sums, stage.image_noise / float(np.median(at.fit.gain)))
+    inliers, excess = _agreement(sums, image_noise / float(np.median(at.fit.gain)))
     camera = stage.camera.with_pose(at.pose)
     alignment = Alignment(camera, excess * covariance, inliers, sums.noise, at.fit.gain)
     return alignment, bool(settled) and not rejected
@@ -291,35 +289,13 @@ def _agreement(sums: AlignmentSums, noise: float) -> tuple[float, float]:
     return float(match.sum() / max(used.sum(), MIN_BLOCKS)), excess
 
 
-def image_noise(image: np.ndarray) -> float:
-    """Standard deviation of the noise of an image (h, w, c): the median of second differences along rows."""
-    rows = image[::8]
-    changes = np.abs(rows[:, 1:-1] - (rows[:, :-2] + rows[:, 2:]) / 2)
-    deviation = float(np.median(changes)) / (0.6745 * math.sqrt(1.5)) if changes.size else 0.0
-    return max(deviation, MIN_IMAGE_NOISE)
-
-
-def _bread(at: Estimate, sums: AlignmentSums, stage: _Stage, frame: Any) -> np.ndarray:
-    """Derivative of the score with respect to pose and exposure, by finite differences of images.
-
-    A motion along the ray of a pixel and a rotation about it do not change the pixel, so that the derivatives
-    by z follow from those by x and y behind a pinhole.
-    """
-    channels = len(sums.matrix)
-    columns = np.concatenate([np.zeros((channels, 8, 6)), sums.matrix[:, :, 6:]], axis=2)
-    angle_step = _DIFFERENCE / max(stage.camera.fx, stage.camera.fy)
-    pinhole = stage.camera.lens is None
-    axes, motions = (0, 1, 3, 4) if pinhole else range(6), []
-    for axis in axes:
-        motion = np.zeros(6)
-        motion[axis] = size = (
-            angle_step if axis < 3 else angle_step / max(math.sqrt(sums.inverse_depth), 1e-3)
-        )
-        motions.append((offset_pose(at.pose, motion), size, axis % 3))
-    fit = at.fit._replace(noise=sums.noise)
-    for axis, rhs in zip(axes, stage.kernels.derivatives(stage.number, frame, fit, motions), strict=True):
+def _bread(score: Score) -> np.ndarray:
+    """Derivative of the score with respect to pose and exposure."""
+    matrix = score.sums.matrix
+    columns = np.concatenate([np.zeros((len(matrix), 8, 6)), matrix[:, :, 6:]], axis=2)
+    for axis, rhs in score.derivatives.items():
         columns[:, :, axis] = rhs[:, :, 0]
-        if pinhole:
+        if len(score.derivatives) < 6:  # see `AlignmentKernels.axes`
             columns[:, :, axis // 3 * 3 + 2] += rhs[:, :, 1]
     return _assembled(columns)
 

@@ -16,7 +16,7 @@ from fidsplat.capture.sensor import Sensor
 from fidsplat.images.files import pixels_of
 from fidsplat.localisation.direct_alignment import MAX_SIDE, MIN_INLIERS, MIN_SIDE, align
 from fidsplat.localisation.initial_pose import most_similar, pose_of_markers, repeated_markers
-from fidsplat.localisation.normal_equations import Source
+from fidsplat.localisation.normal_equations import rendered_scene
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.scenes import Scene
@@ -169,7 +169,7 @@ def localise(
         if not isinstance(scene, ResidentCloud)
         else scene
     )
-    rendered = Source(renderer, uploaded, capture)
+    rendered = rendered_scene(renderer, uploaded, capture)
     source, starts, detected = "start", [], None
     if start is not None:
         pose = start.world_to_camera if isinstance(start, Camera) else start
@@ -208,7 +208,7 @@ def _plain(capture: Capture) -> Capture:
 
 
 def _pixels(image: Any) -> np.ndarray:
-    """An image (h, w, 3) or (h, w, 1) float32 of display values."""
+    """An image (h, w, 3) or (h, w, 1), uint8 or float32 display values."""
     pixels = pixels_of(image)
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
@@ -219,7 +219,7 @@ def _pixels(image: Any) -> np.ndarray:
     if pixels.dtype.kind == "u" and pixels.dtype != np.uint8:
         raise InputError(f"the image must be uint8 or floats, got {pixels.dtype}; convert it first")
     if pixels.dtype == np.uint8:
-        return np.multiply(pixels, np.float32(1 / 255), dtype=np.float32)
+        return pixels
     values = pixels.astype(np.float32)
     largest = float(np.abs(values).max())
     if not largest <= MAX_VALUE:

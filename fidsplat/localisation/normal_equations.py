@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,45 +24,25 @@ from fidsplat.backends.alignment import (
     bins_of,
     lowest_bin,
     noise_factor,
+    noise_of,
 )
-from fidsplat.backends.prepare import prepare
-from fidsplat.cameras import Camera
 from fidsplat.capture.capture import Capture
-from fidsplat.render.frame import Frame
 from fidsplat.render.renderer import Renderer
 from fidsplat.render.resident import ResidentCloud
 from fidsplat.vision.pyramid import convolved, resized
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A scene that is rendered for alignment."""
+def rendered_scene(renderer: Renderer, resident: ResidentCloud, capture: Capture) -> RenderedScene:
+    """An uploaded scene for alignment. capture: with the outputs rgb and depth."""
+    render = partial(renderer.render, resident)
+    return RenderedScene(renderer.backend, resident.all_splats, resident.data, capture, render)
 
-    renderer: Renderer
-    resident: ResidentCloud
-    capture: Capture
 
-    @property
-    def key(self) -> tuple[Any, Any]:
-        """Resident cloud and capture, which are the same objects for equal frames."""
-        return self.resident.data, self.capture
-
-    def render(self, camera: Camera) -> Frame:
-        """Frame with rgb and depth of a camera."""
-        return self.renderer.render(self.resident, self.capture.with_(camera=camera))
-
-    def prepared(self, camera: Camera) -> tuple[Any, Any, Any, np.ndarray]:
-        """Pipeline, resident cloud, view and origin (3,) of the frame of a camera."""
-        splats, backend = self.resident.all_splats, self.renderer.backend
-        features, view = prepare(splats, self.capture.with_(camera=camera))
-        pipeline = backend.pipeline(features, backend.frame_config(view))
-        return pipeline, self.resident.data, view, splats.origin
-
-    def kernels(self) -> AlignmentKernels:
-        """Alignment kernels of the device, or else NumPy, as for stores, whose frames may be on the host."""
-        if self.renderer.backend.has("alignment") and self.resident.data is self.resident.all_splats:
-            return self.renderer.backend.alignment()
-        return HostAlignment()
+def kernels_for(scene: RenderedScene) -> AlignmentKernels:
+    """Alignment kernels of the device, or else NumPy, as for stores, whose frames may be on the host."""
+    if scene.backend.has("alignment") and scene.cloud is scene.splats:
+        return scene.backend.alignment()
+    return HostAlignment()
 
 
 class HostAlignment(AlignmentKernels):
@@ -70,12 +50,26 @@ class HostAlignment(AlignmentKernels):
 
     def load(
         self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
-    ) -> list[int]:
+    ) -> None:
         """Prepare the image for its stages."""
-        self._stages, self._scene = stages, scene
-        self._targets = [_Target(image, stage, max_pixels) for stage in stages]
+        self._stages, self._scene, camera = stages, scene, stages[-1].camera
+        if image.dtype == np.uint8:
+            image = np.multiply(image, np.float32(1 / 255), dtype=np.float32)
+        self._image = resized(image, camera.width, camera.height)
+        self._targets = [_Target(self._image, stage, max_pixels) for stage in stages]
         self._rendered: tuple[Any, ...] = ()
+
+    @property
+    def pixels(self) -> list[int]:
+        """Number of used pixels of each stage."""
         return [len(target.rows) for target in self._targets]
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the noise of the image."""
+        rows = self._image[::8]
+        changes = np.abs(rows[:, 1:-1] - (rows[:, :-2] + rows[:, 2:]) / 2)
+        return noise_of(_median(changes.ravel())) if changes.size else 0.0
 
     def sums(
         self,

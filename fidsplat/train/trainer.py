@@ -306,12 +306,11 @@ class Trainer:
         """The capture of a view at its localised pose; unchanged if its own pose matches the image better."""
         # lazy, since these modules import marker detectors
         from fidsplat.localisation.direct_alignment import align
-        from fidsplat.localisation.normal_equations import Source
+        from fidsplat.localisation.normal_equations import rendered_scene
 
-        image = view.image.astype(np.float32) / 255
-        source = Source(self.renderer, resident, capture.with_(outputs=("rgb", "depth")))
+        scene = rendered_scene(self.renderer, resident, capture.with_(outputs=("rgb", "depth")))
         try:
-            alignment = align(image, view.mask, view.camera, source)
+            alignment = align(view.image, view.mask, view.camera, scene)
         except InputError:  # all pixels of the coarsest level are masked
             return capture
         both = capture, capture.with_(camera=alignment.camera)

@@ -19,7 +19,8 @@ static inline float value_of(global const float *image, int i, int channel, int 
     return channels == 1 ? (at[0] + at[1] + at[2]) / 3.0f : at[channel];
 }
 
-// Index space: (columns, rows) of the level. Reads: a larger image. Writes: means over the pixels of the level.
+// Index space: (columns, rows) of the level. Reads: a larger or equal image, in 8 bits if `is_uint8`. Writes: means over the pixels of the
+// level.
 kernel void align_downsample(
 //@@ arguments align_downsample
 ) {
@@ -29,10 +30,10 @@ kernel void align_downsample(
     int end_x = min((int)ceil(right - 1e-3f), full_width), end_y = min((int)ceil(bottom - 1e-3f), full_height);
     for (int row = (int)top; row < end_y; row++)
         for (int column = (int)left; column < end_x; column++) {
-            global const float *at = image + (row * (size_t)full_width + column) * channels;
+            size_t at = (row * (size_t)full_width + column) * channels;
             float share = fmin(right, column + 1.0f) - fmax(left, (float)column);
             share *= fmin(bottom, row + 1.0f) - fmax(top, (float)row);
-            for (int c = 0; c < channels; c++) sum[c] += share * at[c];
+            for (int c = 0; c < channels; c++) sum[c] += share * (is_uint8 ? bytes[at + c] * (1.0f / 255.0f) : image[at + c]);
         }
     for (int c = 0; c < channels; c++) result[(y * (size_t)width + x) * channels + c] = sum[c] / (ratio_x * ratio_y);
 }
@@ -96,7 +97,63 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_texture(
             bins[i] = (uchar)bin;
             COUNT(group_counts, bin);
         }
-    add_bins(group_counts, counts + row * BINS);
+    add_bins(group_counts, counts + stage * BINS);
+}
+
+// Index space: any number of work-groups of ITEMS, by every eighth row. Adds the second differences along the rows of an image to a
+// histogram, for the noise of the image.
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_noise(
+//@@ arguments align_noise
+) {
+    local uint group_counts[BINS];
+    for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int y = 8 * get_group_id(0); y < height; y += 8 * get_num_groups(0)) {
+        global const float *row = image + y * (size_t)(width * channels);
+        for (int i = channels + get_local_id(0); i < (width - 1) * channels; i += ITEMS)
+            COUNT(group_counts, bin_of(fabs(row[i] - (row[i - channels] + row[i + channels]) / 2.0f)));
+    }
+    add_bins(group_counts, counts + stage * BINS);
+}
+
+#define SHARE (BINS / ITEMS)
+
+// Median of a histogram, linear within its bin. Called by the complete group.
+static inline float median_of(global const uint *counts, local uint *shares) {
+    uint item = get_local_id(0), sum = 0, total = 0, before = 0, share = 0;
+    for (uint k = 0; k < SHARE; k++) sum += item + k > 0 ? counts[item * SHARE + k] : 0;   // bin 0 is of unused pixels
+    shares[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint other = 0; other < ITEMS; other++) total += shares[other];
+    while (share < ITEMS - 1 && 2 * (before + shares[share]) < total) before += shares[share++];
+    uint k = max(share * SHARE, 1u);
+    while (k < BINS - 1 && 2 * (before + counts[k]) < total) before += counts[k++];
+    float low = as_float((FIRST_BIN + k) << 19), high = as_float((FIRST_BIN + k + 1) << 19);
+    return low + (high - low) * (0.5f * total - before) / fmax((float)counts[k], 1.0f);
+}
+
+// Index space: one work-group of ITEMS per stage, and one more. Reads and clears: the histograms of `align_texture` and `align_noise`.
+// Writes: of each stage the lowest bin to use, so that it and the higher bins have about max_pixels pixels; their numbers of pixels; the
+// median of the second differences.
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_thresholds(
+//@@ arguments align_thresholds
+) {
+    local uint shares[ITEMS];
+    int stage = get_group_id(0);
+    global uint *own = counts + stage * BINS;
+    float median = median_of(own, shares);
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    if (get_local_id(0) > 0) return;
+    uint total = 0, pixels = 0, bin = BINS;
+    if (stage == stages) thresholds[2 * stages] = as_uint(median);
+    else {
+        for (uint k = 1; k < BINS; k++) total += own[k];
+        do pixels += own[--bin];
+        while (bin > 1 && pixels < min(total, max_pixels));
+        thresholds[stage] = bin;
+        thresholds[stages + stage] = pixels;
+    }
+    for (uint k = 0; k < BINS; k++) own[k] = 0;
 }
 
 // Residuals of a pixel: image, without gain and offset, minus render. Returns their root mean square.
@@ -111,32 +168,46 @@ static inline float residuals_of(
     return sqrt(square / channels);
 }
 
+#define SPAN (ITEMS > 1 ? 2 * ITEMS : 1024)
+#define CONVERGED 7   // index in `fit`: whether the level has converged, so that its sums are not needed
 #define EXPOSURE const float gain[3] = {fit[0], fit[1], fit[2]}, offset[3] = {fit[3], fit[4], fit[5]}
 
-// Index space: any number of work-groups of ITEMS, by rows. Adds the errors of textured pixels to a histogram.
+#if ITEMS > 1
+// A channel of a pixel of an image of three channels after `align_blur` along both axes.
+static inline float blurred(global const float *image, int x, int y, int c, int width, int height, global const float *taps, int radius) {
+    float sum = 0.0f;
+    for (int j = -radius; j <= radius; j++) {
+        global const float *row = image + clamp(y + j, 0, height - 1) * (size_t)width * 3 + c;
+        float part = 0.0f;
+        for (int i = -radius; i <= radius; i++) part += taps[abs(i)] * row[3 * clamp(x + i, 0, width - 1)];
+        sum += taps[abs(j)] * part;
+    }
+    return sum;
+}
+#endif
+
+// Index space: any number of work-groups of ITEMS, by SPAN pixels. Adds the errors of textured pixels to a histogram. On GPUs it also
+// blurs the render, in the same launch.
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_errors(
 //@@ arguments align_errors
 ) {
     local uint group_counts[BINS];
     EXPOSURE;
+    uint min_bin = thresholds[stage];
     for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (int y = get_group_id(0); y < height; y += get_num_groups(0))
-        for (int i = y * width + get_local_id(0); i < (y + 1) * width; i += ITEMS) {
+    int pixels = fit[CONVERGED] != 0.0f ? 0 : width * height;
+    for (int first = get_group_id(0) * SPAN; first < pixels; first += get_num_groups(0) * SPAN)
+        for (int i = first + get_local_id(0); i < min(first + SPAN, pixels); i += ITEMS) {
             float residual[3];
+#if ITEMS > 1
+            if (radius)
+                for (int c = 0; c < 3; c++) rgb[3 * (size_t)i + c] = blurred(rendered, i % width, i / width, c, width, height, taps, radius);
+#endif
             if (bins[i] < min_bin) continue;
             COUNT(group_counts, bin_of(residuals_of(i, channels, image, rgb, gain, offset, residual)));
         }
     add_bins(group_counts, counts);
-}
-
-// Median of a histogram, linear within its bin.
-static inline float median_of(global const uint *counts) {
-    uint total = 0, before = 0, k = 1;
-    for (uint other = 1; other < BINS; other++) total += counts[other];
-    while (k < BINS - 1 && 2 * (before + counts[k]) < total) before += counts[k++];
-    float low = as_float((FIRST_BIN + k) << 19), high = as_float((FIRST_BIN + k + 1) << 19);
-    return low + (high - low) * (0.5f * total - before) / fmax((float)counts[k], 1.0f);
 }
 
 // Set the weight, the weight of the second derivative, and the loss of an error.
@@ -153,35 +224,47 @@ static inline void robust(float error, float noise, int huber, int channels, flo
     *cost = 1.0f - inner * inner * inner;
 }
 
-// Inverse depth, the largest of a pixel and its neighbours; 0 for the background.
-static inline float nearest(global const float *depth, int i, int width) {
-    float depths[5] = {depth[i], depth[i - 1], depth[i + 1], depth[i - width], depth[i + width]}, largest = 0.0f;
-    for (int k = 0; k < 5; k++)
-        if (depths[k] > 0.0f) largest = fmax(largest, 1.0f / depths[k]);
+// Inverse depth, the largest of a pixel and its neighbours; 0 for the background. depth: an image of depth_width columns, ratio_x and
+// ratio_y pixels for each pixel of the level.
+static inline float nearest(global const float *depth, int x, int y, int depth_width, float ratio_x, float ratio_y) {
+    float largest = 0.0f;
+    for (int k = 0; k < 5; k++) {
+        int row = (int)((y + (k == 3) - (k == 4) + 0.5f) * ratio_y), column = (int)((x + (k == 1) - (k == 2) + 0.5f) * ratio_x);
+        float one = depth[row * (size_t)depth_width + column];
+        if (one > 0.0f) largest = fmax(largest, 1.0f / one);
+    }
     return largest;
 }
 
-// Index space: work-groups of ITEMS; group g has the blocks g, g + groups, ... of block_size x block_size pixels. Reads: image, render, depth,
-// the rays of a lens, counts of `align_errors`, the render after a motion. Writes: the sums of each group, in a fixed order.
+#if ITEMS > 1
+#define CHANNELS 1   // channels of a work-group: the sums of one channel fit into registers
+#else
+#define CHANNELS 3
+#endif
+#define OWN_SUMS (8 * (CHANNEL_ROWS * CHANNELS + 1))
+
+// Index space: work-groups of ITEMS, on GPUs for each channel; group g has the blocks g, g + groups, ... of block_size x block_size
+// pixels. Reads: image, render, depth, the rays of a lens, counts of `align_errors`, the render after a motion. Writes: the sums of each
+// group, in a fixed order.
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
 //@@ arguments align_sums
 ) {
-    local float partial[ITEMS][SUMS];
-    local float shared_noise;
+    local float partial[ITEMS][OWN_SUMS + 1];
+    local uint shares[ITEMS];
     EXPOSURE;
+    uint min_bin = thresholds[stage];
     const float noise_before = fit[6];
     uint item = get_local_id(0);
-    if (item == 0) {
-        float own = fmax(noise_factor * median_of(counts), MIN_NOISE);
-        shared_noise = noise_before > 0.0f ? fmin(own, noise_before) : own;
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    float noise = shared_noise;
+    int parts = CHANNELS == 1 ? channels : 1, first_channel = get_group_id(0) % parts, end_channel = min(first_channel + CHANNELS, channels);
+    int group = get_group_id(0) / parts, groups = get_num_groups(0) / parts;
+    float noise = fmax(noise_factor * median_of(counts, shares), MIN_NOISE);
+    if (noise_before > 0.0f) noise = fmin(noise, noise_before);
     // others: squares of three channels, number of pixels, two losses, squared inverse depths
-    float8 totals[CHANNEL_ROWS * 3], others = 0.0f;
-    for (int k = 0; k < CHANNEL_ROWS * 3; k++) totals[k] = 0.0f;
+    float8 totals[CHANNEL_ROWS * CHANNELS], others = 0.0f;
+    for (int k = 0; k < CHANNEL_ROWS * CHANNELS; k++) totals[k] = 0.0f;
     int across_blocks = (width + block_size - 1) / block_size, blocks = across_blocks * ((height + block_size - 1) / block_size);
-    for (int block = get_group_id(0); block < blocks; block += get_num_groups(0)) {
+    if (fit[CONVERGED] != 0.0f) blocks = 0;   // PoCL 3 executes later barriers wrongly after a return
+    for (int block = group; block < blocks; block += groups) {
         int left = block % across_blocks * block_size, top = block / across_blocks * block_size;
         int right = min(left + block_size, width), bottom = min(top + block_size, height);
         for (int y = top + item / ROW_ITEMS; y < bottom; y += ITEMS / ROW_ITEMS)
@@ -189,7 +272,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                 int i = y * width + x;
                 if (bins[i] < min_bin) continue;
                 float residual[3], weight, hessian_weight, cost, before;
-                float error = residuals_of(i, channels, image, rgb, gain, offset, residual), inverse = nearest(depth, i, width);
+                float error = residuals_of(i, channels, image, rgb, gain, offset, residual), inverse = nearest(depth, x, y, depth_width, ratio_x, ratio_y);
                 robust(error, noise_before > 0.0f ? noise_before : noise, huber, channels, &weight, &hessian_weight, &before);
                 robust(error, noise, huber, channels, &weight, &hessian_weight, &cost);
                 float3 ray = {(x + 0.5f - center_x) / focal_x, (y + 0.5f - center_y) / focal_y, 1.0f};
@@ -208,7 +291,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                 // with `has_perturbed` the right-hand side is a column of the Hessian, else the gradient
                 float scale = axis == 0 ? -ray.x : axis == 1 ? -ray.y : -ray.z, column_weight = has_perturbed ? hessian_weight : weight;
                 float squares[3] = {0.0f, 0.0f, 0.0f};
-                for (int c = 0; c < channels; c++) {
+                for (int c = first_channel; c < end_channel; c++) {
                     float gx = (value_of(rgb, i + 1, c, channels) - value_of(rgb, i - 1, c, channels)) / 2.0f;
                     float gy = (value_of(rgb, i + width, c, channels) - value_of(rgb, i - width, c, channels)) / 2.0f;
                     if (huber) {
@@ -217,7 +300,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
                     }
                     float value = value_of(rgb, i, c, channels), column = residual[c];
                     if (has_perturbed) column = (value_of(perturbed, i, c, channels) - value) / step;
-                    float8 row = -(gx * motion_x + gy * motion_y), *total = totals + c * CHANNEL_ROWS;
+                    float8 row = -(gx * motion_x + gy * motion_y), *total = totals + (c - first_channel) * CHANNEL_ROWS;
                     row.s67 = (float2)(value, 1.0f);
                     float8 weighted = hessian_weight * row, entry = column_weight * column * row;
                     for (int k = 0; k < 8; k++) total[k] += ((const float *)&weighted)[k] * row;
@@ -230,31 +313,17 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_sums(
             }
     }
     local float *sums = partial[item];
-    for (int k = 0; k < CHANNEL_ROWS * 3; k++) vstore8(totals[k], k, sums);
-    vstore8(others, CHANNEL_ROWS * 3, sums);
+    for (int k = 0; k < CHANNEL_ROWS * CHANNELS; k++) vstore8(totals[k], k, sums);
+    vstore8(others, CHANNEL_ROWS * CHANNELS, sums);
     barrier(CLK_LOCAL_MEM_FENCE);
-    size_t into = get_group_id(0) * (size_t)(SUMS + 1);
-    for (int k = item; k < SUMS; k += ITEMS) {
+    // the scalars of all channels are those of the first, except the squares
+    global float *into = result + group * (size_t)(SUMS + 1);
+    for (int k = item; k < OWN_SUMS; k += ITEMS) {
+        int scalar = k - 8 * CHANNEL_ROWS * CHANNELS;
+        if (CHANNELS == 1 && scalar >= 0 && scalar != first_channel && (scalar < 3 || first_channel > 0)) continue;
         float sum = 0.0f;
         for (int other = 0; other < ITEMS; other++) sum += partial[other][k];
-        result[into + k] = sum;
+        into[scalar < 0 ? 8 * CHANNEL_ROWS * first_channel + k : 8 * CHANNEL_ROWS * 3 + scalar] = sum;
     }
-    if (item == 0) result[into + SUMS] = noise;
-}
-
-// Index space: one work-group. Reads: the sums of `groups` work-groups, and the counts of the rendered frame. Writes: their totals, the
-// noise, and 1 if the frame exceeded its buffers, else 0; clears the histogram of `align_errors`.
-kernel void align_totals(
-//@@ arguments align_totals
-) {
-    for (uint k = get_local_id(0); k < SUMS; k += get_local_size(0)) {
-        float sum = 0.0f;
-        for (int g = 0; g < groups; g++) sum += result[g * (size_t)(SUMS + 1) + k];
-        totals[k] = sum;
-    }
-    for (uint k = get_local_id(0); k < BINS; k += get_local_size(0)) counts[k] = 0;
-    if (get_local_id(0) == 0) {
-        totals[SUMS] = result[SUMS];
-        totals[SUMS + 1] = frame_counts[0] > big_capacity || frame_counts[1] > pair_capacity || frame_counts[2];
-    }
+    if (item == 0 && first_channel == 0) into[SUMS] = noise;
 }

@@ -21,7 +21,7 @@ from fidsplat.cli import main
 from fidsplat.images.files import write_png
 from fidsplat.localisation import Localisation, direct_alignment
 from fidsplat.localisation.direct_alignment import stages_of
-from fidsplat.localisation.normal_equations import HostAlignment, Source
+from fidsplat.localisation.normal_equations import HostAlignment, kernels_for, rendered_scene
 from fidsplat.splats.rotations import rigid_matrix
 from fidsplat.vision.pose import pose_error
 
@@ -228,16 +228,20 @@ def test_sums_of_the_device_agree_with_numpy(renderer, room, lens):
     mask = np.ones((48, 64), bool)
     mask[10:20, 30:40] = False
     stages = [stage for stage, _ in stages_of(camera, mask)]
-    stages.append(stages[0]._replace(camera=camera.resampled(27, 19), ignored=None, block_size=5))
+    stages.insert(0, stages[0]._replace(camera=camera.resampled(27, 19), ignored=None, block_size=5))
     moved = offset_camera(camera, np.array([0, 0, 0, 0, 1e-3, 0]))
     both = HostAlignment(), renderer.backend.alignment()
     noisy = image + np.random.default_rng(1).normal(0, 0.01, image.shape).astype(np.float32)
-    host, device = [kernels.load(noisy, stages, 1500, None) for kernels in both]
+    for kernels in both:
+        kernels.load(noisy, stages, 1500, None)
+    host, device = [kernels.pixels for kernels in both]
     assert host == device
+    assert both[1].noise == pytest.approx(both[0].noise, rel=1e-3)
+    assert both[0].noise == pytest.approx(0.01, rel=0.3)
     assert min(host) > 300
-    assert host[0] < 1700
+    assert host[1] < 1700
     fit = AlignmentFit(np.array([0.9, 1.0, 1.2]), np.array([0.02, 0.0, -0.01]), huber=True)
-    for number, fitted, change in ((0, fit, False), (4, fit, False), (3, fit._replace(huber=False), True)):
+    for number, fitted, change in ((1, fit, False), (0, fit, False), (4, fit._replace(huber=False), True)):
         render = partial(renderer.render, resident, outputs=("rgb", "depth"))
         frame = render(stages[number].camera)
         options = {"perturbed": PerturbedFrame(render(moved), 1e-3, 1)} if change else {"blocks": True}
@@ -261,25 +265,28 @@ def test_steps_on_the_device_agree_with_numpy(room, monkeypatch, far, sky):
     if sky:
         capture = capture.with_(background=fs.Gradient((0.2, 0.4, 0.9), (0.5, 0.4, 0.3)))
         image = renderer.render(scene, capture, outputs="rgb")["rgb"]
-    source = Source(renderer, renderer.upload(scene), capture)
+    source = rendered_scene(renderer, renderer.upload(scene), capture)
     image = image * np.float32([0.7, 0.9, 1.1]) + np.float32(0.03)
     start = offset_camera(scene.camera, far * START).world_to_camera
     levels = [stage for stage, _ in stages_of(scene.camera)]
     at = Estimate(start, AlignmentFit(np.ones(3), np.zeros(3), huber=True))
-    numpy, kernels = HostAlignment(), source.kernels()
+    numpy, kernels = HostAlignment(), kernels_for(source)
     for each in (numpy, kernels):
         each.load(image, levels, 1500, source)
-    device = None
-    while device is None:  # first, NumPy's frames enlarge the buffers of the lists
-        host = direct_alignment._minimise(at, direct_alignment._Stage(3, levels[3].camera, numpy), 6, 0.02)
-        device = kernels.minimise(3, at, 6, 0.02, 1e-3)
+    stage, found = direct_alignment._Stage(3, levels[3].camera, numpy), None
+    while found is None:  # first, NumPy's frames enlarge the buffers of the lists
+        host, expected = direct_alignment._minimise(at, [(stage, 6)], stage, 0.02)
+        found = kernels.minimise(at, [(3, 6)], 3, 0.02)
+    device, score = found
     np.testing.assert_allclose(device.pose, host.pose, atol=2e-5)
     np.testing.assert_allclose(device.fit.gain, host.fit.gain, rtol=1e-4)
     np.testing.assert_allclose(device.fit.offset, host.fit.offset, atol=1e-4)
     assert device.noise == pytest.approx(host.noise, rel=1e-3)
     assert sky == (pose_difference(scene.camera.with_pose(device.pose), scene.camera)[0] < 5)
+    for axis, rhs in expected.derivatives.items():
+        np.testing.assert_allclose(score.derivatives[axis], rhs, atol=0.02 * np.abs(rhs).max())
     kernels.sums(3, kernels.frame(3, start), at.fit)  # adds to the histogram of errors
-    again = kernels.minimise(3, at, 6, 0.02, 1e-3)
+    again, _ = kernels.minimise(at, [(3, 6)], None, 0.02)
     np.testing.assert_array_equal(again.pose, device.pose)
     assert again.noise == device.noise
 

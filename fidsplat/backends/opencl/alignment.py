@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -12,6 +13,9 @@ import pyopencl as cl
 
 from fidsplat.backends.alignment import (
     BINS,
+    DAMPING,
+    DIFFERENCE,
+    STEP,
     AlignmentFit,
     AlignmentKernels,
     AlignmentSums,
@@ -19,8 +23,9 @@ from fidsplat.backends.alignment import (
     Estimate,
     PerturbedFrame,
     RenderedScene,
-    lowest_bin,
+    Score,
     noise_factor,
+    noise_of,
 )
 from fidsplat.backends.opencl.assemble import assemble_alignment, assemble_alignment_step
 from fidsplat.backends.opencl.command_list import CommandList
@@ -36,11 +41,17 @@ _GROUPS = {1: 32, 32: 256}
 """maximum number of work-groups of a sum, by the size of a work-group"""
 _GROUP_FLOATS = 249
 """floats that a work-group writes: SUMS of alignment.cl, and the noise"""
-_STATE = 192
-"""floats of the buffer `state` (alignment_step.cl); the host reads the first `_COST`"""
-_CONVERGED, _NOISE, _POSE, _COST = 0, 1, 2, 20
-_INCOMPLETE = 2
-"""indices in `state`, and value of `state[CONVERGED]` if a frame exceeded its buffers"""
+_STATE = 224
+"""floats of the buffer `state` (alignment_step.cl); the host reads the first `_READ`"""
+_CONVERGED, _NOISE, _INCOMPLETE, _EXPOSURE_KNOWN, _READ = range(7, 12)
+"""indices in `state`, after gain, offset and noise of the next frame"""
+_POSE = 15
+"""numbers of the pose of a view: rotation, translation and eye"""
+_FEW = 4
+"""number of steps after which the host first reads whether a stage with at least twice as many has
+converged"""
+_ATTEMPTS = 8
+"""maximum number of attempts to record commands while buffers are replaced"""
 _MAX_REPLAYS = 16
 """maximum number of cached command lists of a cloud"""
 _ZERO = np.zeros(1, np.uint32)
@@ -54,41 +65,59 @@ class OpenCLAlignment(AlignmentKernels):
         self._items = 1 if workspace.config.schedule == "lanes" else 32
         self._program = Program(workspace, assemble_alignment(self._items))
         self._commands, self._pyramid_commands = CommandList(self._program), CommandList(self._program)
-        self._steps: dict[bool, Program] = {}
+        self._step_programs: dict[bool, Program] = {}
         """programs of `align_step`, by whether view records are float64"""
-        self._lists: dict[tuple[int, bool], tuple[CommandList, CommandList]] = {}
+        self._lists: dict[Any, _StageCommands] = {}
+        """command lists of steps, by stage and whether the views are float64; and of scores"""
         self._replays: WeakKeyDictionary[Any, dict[Any, _Replayed]] = WeakKeyDictionary()
         self._stage_arguments: list[dict[str, Any]] = []
         """kernel arguments of each stage"""
+        self._thresholds: np.ndarray | None = None
+        """what `align_thresholds` wrote, once it is read"""
         self._uploads: deque[cl.Event | None] = deque(maxlen=16)
         """keeps arrays alive until the device has read them"""
 
     def load(
         self, image: np.ndarray, stages: list[CoarseToFineStage], max_pixels: int, scene: RenderedScene
-    ) -> list[int]:
-        with self._workspace.lock, self._workspace.device_errors("localising"):
-            self._scene = scene
-            histograms = self._scratch("textures", 4 * BINS * len(stages))
+    ) -> None:
+        count = len(stages)
+        with self._workspace.rendering():
+            self._scene, self._thresholds, pool = scene, None, self._workspace.pool
+            size = 4 * BINS * (count + 1)
+            histograms = pool.zeroed("alignment: textures", size, self._queue)
             full = self._upload("image", image), image.shape
-            key = self._workspace.pool.generation, image.shape, [id(stage) for stage in stages]
+            self._is_uint8 = image.dtype == np.uint8
+            key = pool.generation, image.shape, self._is_uint8, max_pixels, [id(stage) for stage in stages]
             if self._pyramid_commands.key != key:
                 self._pyramid_commands.clear()
                 self._stages, self._stage_arguments, source = stages, [], full
                 for number, stage in reversed([*enumerate(stages)]):  # each image from the next finer one
                     args, source = self._prepared(number, stage, source, full, histograms)
                     self._stage_arguments.insert(0, args)
-                self._pyramid_commands.key = self._workspace.pool.generation, *key[1:]
-            cl.enqueue_fill_buffer(self._queue, histograms, _ZERO, 0, 4 * BINS * len(stages))
+                # the image of the last stage without its blur
+                own = {**self._stage_arguments[-1], "stage": count, "stages": count, "max_pixels": max_pixels}
+                own["image"] = self._finest
+                size = self._size(min(-(-own["height"] // 8), _GROUPS[self._items]))
+                self._launch("align_noise", *size, own, self._pyramid_commands)
+                self._launch("align_thresholds", *self._size(count + 1), own, self._pyramid_commands)
+                self._pyramid_commands.key = pool.generation, *key[1:]
             self._pyramid_commands.submit(self._queue)
-            texture_histograms = np.empty((len(stages), BINS), np.uint32)
-            cl.enqueue_copy(self._queue, texture_histograms, histograms)
-        pixels = []
-        for args, texture_histogram in zip(
-            self._stage_arguments, texture_histograms.astype(np.int64), strict=True
-        ):
-            args["min_bin"] = min_bin = lowest_bin(texture_histogram, max_pixels)
-            pixels.append(int(texture_histogram[min_bin:].sum()))
-        return pixels
+
+    @property
+    def pixels(self) -> list[int]:
+        count = len(self._stages)
+        return self._read_thresholds()[count : 2 * count].tolist()
+
+    @property
+    def noise(self) -> float:
+        return noise_of(float(self._read_thresholds()[2 * len(self._stages) :].view(np.float32)[0]))
+
+    def _read_thresholds(self) -> np.ndarray:
+        if self._thresholds is None:
+            buffer, count = self._stage_arguments[0]["thresholds"], 2 * len(self._stages) + 1
+            with self._workspace.rendering():
+                self._thresholds = self._read(buffer, (count,), np.uint32)
+        return self._thresholds
 
     def _prepared(
         self, number: int, stage: CoarseToFineStage, source: _Image, full: _Image, histograms: cl.Buffer
@@ -102,16 +131,18 @@ class OpenCLAlignment(AlignmentKernels):
         if full_width % camera.width or full_height % camera.height:
             finer, (full_height, full_width, _) = full
         width, height, size = camera.width, camera.height, 4 * camera.width * camera.height
+        is_uint8 = int(self._is_uint8 and finer is full[0])
         args = {
             **{"width": width, "height": height, "channels": channels, "block_size": stage.block_size},
-            **{"full_width": full_width, "full_height": full_height},
+            **{"full_width": full_width, "full_height": full_height, "is_uint8": is_uint8, "bytes": finer},
             **{"ratio_x": full_width / width, "ratio_y": full_height / height},
             **{"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy},
             # an argument must be a buffer, even where the kernel does not read it
             **{"lens": int(camera.lens is not None), "rays": finer, "taps": finer, "mask": finer},
-            **{"masked": int(stage.ignored is not None), "radius": len(stage.taps) - 1, "row": number},
+            **{"masked": int(stage.ignored is not None), "radius": len(stage.taps) - 1, "stage": number},
             "bins": self._scratch(f"bins {number}", size // 4),
             "counts": histograms,
+            "thresholds": self._scratch("thresholds", 4 * 64),
         }
         if camera.lens is not None:
             raster = raster_of(camera.lens, width, height, camera.fx, camera.fy, camera.cx, camera.cy)
@@ -121,39 +152,35 @@ class OpenCLAlignment(AlignmentKernels):
         if args["radius"]:
             args["taps"] = self._upload(f"taps {number}", stage.taps)
         image = finer
-        if (width, height) != (full_width, full_height):
+        if (width, height) != (full_width, full_height) or is_uint8:
             image = self._scratch(f"image {number}", channels * size)
             grid = -(-width // 64) * 64, height
             arguments = {**args, "image": finer, "result": image}
             self._launch("align_downsample", grid, (64, 1), arguments, self._pyramid_commands)
+        if not self._stage_arguments:
+            self._finest = image
         args["image"] = self._blurred(image, args, f"image {number}", channels, self._pyramid_commands)
         self._launch("align_texture", *self._size(self._rows(height)), args, self._pyramid_commands)
         return args, (image, (height, width, channels))
 
-    def frame(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> Any:
-        with self._workspace.rendering():
-            replayed = self._replay(stage, pose, perturbed)
-            if replayed is not None and replayed.is_complete():
-                return replayed.images[perturbed]
-        return super().frame(stage, pose)
-
-    def _replay(self, stage: int, pose: np.ndarray, perturbed: bool = False) -> _Replayed | None:
-        """Submit a frame of a stage without waiting. None if it cannot be replayed: on CPUs, in chunks, for
-        an empty cloud, with moving groups, a shutter or parallel rays."""
-        camera, (cloud, capture) = self._stages[stage].camera, self._scene.key
+    def _replay(self, pose: np.ndarray) -> _Replayed | None:
+        """The replayed frames of the last stage. GPUs reduce them for the other stages: the pixels of smaller
+        frames have more splats, which a work-item blends one by one. None if the frames cannot be replayed:
+        on CPUs, in chunks, for an empty cloud, with moving groups, a shutter or parallel rays. pose: any
+        valid pose."""
+        camera, cloud = self._stages[-1].camera, self._scene.cloud
         sizes = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
-        key = capture, *sizes, camera.near, camera.far, camera.lens
+        key = self._scene.capture, *sizes, camera.near, camera.far, camera.lens
         replays = self._replays.setdefault(cloud, {})
         replayed = replays.get(key)
         if replayed is None or not replayed.bind():
             if len(replays) >= _MAX_REPLAYS:
                 replays.clear()
-            replayed = _Replayed.of(self._workspace, *self._scene.prepared(camera.with_pose(pose)))
+            pipeline, view, origin = self._scene.prepared(camera.with_pose(pose))
+            replayed = _Replayed.of(self._workspace, pipeline, cloud, view, origin)
             if replayed is None:
                 return None
             replays[key] = replayed
-        replayed.set_pose(pose)
-        replayed.submit(perturbed)
         return replayed
 
     def sums(
@@ -167,113 +194,216 @@ class OpenCLAlignment(AlignmentKernels):
         channels, args = len(fit.gain), self._stage_arguments[stage]
         groups = self._groups(args, blocks)
         with self._workspace.lock, self._workspace.device_errors("localising"):
-            args = self._sum_arguments(args, frame, fit, groups)
+            rendered, depth = (frame.images.buffer(name) for name in ("rgb", "depth"))
+            args = self._sum_arguments(args, rendered, depth, channels, fit.huber, groups)
+            args["fit"] = self._upload("fit", _packed_fit(fit))
+            if self._items == 1:
+                args["rgb"] = self._blurred(rendered, args, "render", 3)
             if perturbed is not None:
                 args["perturbed"] = self._blurred(
                     perturbed.frame.images.buffer("rgb"), args, "perturbed frame", 3
                 )
                 args |= {"has_perturbed": 1, "step": perturbed.size, "axis": perturbed.axis}
             self._clear_errors()
-            self._upload_fit(fit)
-            self._by_groups("align_errors", self._rows(args["height"]), args)
-            self._by_groups("align_sums", groups, args)
-            packed = np.empty((groups, _GROUP_FLOATS), np.float32)
-            cl.enqueue_copy(self._queue, packed, args["result"])
+            self._launch("align_errors", *self._errors_size(args), args)
+            self._launch("align_sums", *self._sums_size(groups, channels), args)
+            packed = self._read(args["result"], (groups, _GROUP_FLOATS))
         return _unpacked(packed, channels, blocks, perturbed is not None)
 
-    def derivatives(
-        self, stage: int, frame: Any, fit: AlignmentFit, motions: Sequence[tuple[np.ndarray, float, int]]
-    ) -> list[np.ndarray]:
-        workspace, stage_arguments = self._workspace, self._stage_arguments[stage]
-        with workspace.rendering():
-            if isinstance(frame, _ReplayedImages):
-                groups, totals = self._groups(stage_arguments, False), []
-                args = self._sum_arguments(stage_arguments, frame, fit, groups)
+    def block_sums(self, stage: int, at: Estimate) -> AlignmentSums:
+        with self._workspace.rendering():
+            replayed = self._replay(at.pose) if stage == len(self._stages) - 1 else None
+            if replayed is not None:
+                commands, channels = self._score_commands(stage, replayed, len(at.fit.gain)), len(at.fit.gain)
+                replayed.set_pose(at.pose)
+                self._copy(commands.state, _packed_fit(at.fit))
                 self._clear_errors()
-                self._upload_fit(fit)
-                self._by_groups("align_errors", self._rows(stage_arguments["height"]), args)
-                for number, (pose, size, axis) in enumerate(motions):
-                    replayed = self._replay(stage, pose, True)
-                    if replayed is None:
-                        break
-                    image = replayed.images[True].buffer("rgb")
-                    args["perturbed"] = self._blurred(image, args, "perturbed frame", 3)
-                    args |= {"has_perturbed": 1, "step": size, "axis": axis}
-                    self._by_groups("align_sums", groups, args)
-                    totals.append(self._scratch(f"totals {number}", 4 * (_GROUP_FLOATS + 1)))
-                    # `align_totals` clears `counts`: another buffer, so that the histogram of residuals stays
-                    counts = {"counts": self._scratch("unused", 4 * BINS)}
-                    self._launch(
-                        *("align_totals", (256,), (256,)),
-                        args | counts | replayed.arguments(groups, totals[-1]),
-                    )
-                packed = np.empty((len(totals), _GROUP_FLOATS + 1), np.float32)
-                for row, buffer in zip(packed, totals, strict=True):
-                    cl.enqueue_copy(self._queue, row, buffer)
-                if len(totals) == len(motions) and not packed[:, _GROUP_FLOATS].any():
-                    return [
-                        _unpacked(row[None, :_GROUP_FLOATS], len(fit.gain), False, True).rhs for row in packed
-                    ]
-        return super().derivatives(stage, frame, fit, motions)
+                replayed.submit()
+                commands.sums[0].submit(self._queue)
+                packed = self._read(commands.result, (commands.groups, _GROUP_FLOATS))
+                if replayed.is_complete():
+                    return _unpacked(packed, channels, True, False)
+        return super().block_sums(stage, at)
 
     def minimise(
-        self, stage: int, at: Estimate, steps: int, tolerance: float, damping: float
-    ) -> Estimate | None:
-        channels = len(at.fit.gain)
+        self, at: Estimate, steps: Sequence[tuple[int, int]], last: int | None, tolerance: float
+    ) -> tuple[Estimate, Score | None] | None:
         with self._workspace.rendering():
-            replayed = self._replay(stage, at.pose)
+            recorded = self._recorded(at, steps, last, tolerance)
+            if recorded is None:
+                return None
+            state, pose, score = self._minimise(at, steps, *recorded)
+        if state[_INCOMPLETE]:
+            return None
+        gain, offset = state[:6].reshape(2, 3)[:, : len(at.fit.gain)].astype(float)
+        return Estimate(pose, at.fit._replace(gain=gain, offset=offset), float(state[_NOISE])), score
+
+    def _recorded(
+        self, at: Estimate, steps: Sequence[tuple[int, int]], last: int | None, tolerance: float
+    ) -> tuple[_Replayed, list[_StageCommands], _StageCommands | None] | None:
+        """Frames, commands of each stage, and of the score at the stage `last`. None if the frames cannot be
+        replayed."""
+        channels, pool = len(at.fit.gain), self._workspace.pool
+        for _ in range(_ATTEMPTS):  # recording may replace buffers of earlier recordings
+            generation, replayed = pool.generation, self._replay(at.pose)
             if replayed is None:
                 return None
-            state = np.zeros(_STATE, np.float32)
-            state[_COST : _COST + 4] = np.inf, 10 * damping, 0, at.noise > 0
-            buffer = self._upload("state", state)
-            self._upload_fit(at.fit)
-            lists = self._step_lists(stage, replayed, at.fit, tolerance)
-            self._clear_errors()
-            found = np.empty(_COST, np.float32)
-            # one more iteration if the noise is unknown: the first one estimates it
-            for number in range(steps + (not at.noise)):
-                if number:
-                    replayed.set_rotation(found[_POSE : _POSE + 9])
-                    replayed.submit()
-                for commands in lists:
-                    commands.submit(self._queue)
-                cl.enqueue_copy(self._queue, found, buffer)
-                if found[_CONVERGED]:
-                    break
-        if found[_CONVERGED] == _INCOMPLETE:
-            return None
-        gain, offset = found[_POSE + 12 :].reshape(2, 3)[:, :channels].astype(float)
-        pose = replayed.world_to_camera(found[_POSE : _POSE + 12])
-        return Estimate(pose, at.fit._replace(gain=gain, offset=offset), float(found[_NOISE]))
+            commands = [self._step_commands(stage, replayed, channels, tolerance) for stage, _ in steps]
+            score = None if last is None else self._score_commands(last, replayed, channels)
+            if replayed.bind() and pool.generation is generation:
+                return replayed, commands, score
+        return None
 
-    def _step_lists(
-        self, stage: int, replayed: _Replayed, fit: AlignmentFit, tolerance: float
-    ) -> tuple[CommandList, CommandList]:
-        """Command lists of the sums of a frame, and of a step."""
-        stage_arguments, double = self._stage_arguments[stage], replayed.record.dtype == np.float64
-        if double not in self._steps:
-            self._steps[double] = Program(self._workspace, assemble_alignment_step(double))
-        if (stage, double) not in self._lists:
-            self._lists[stage, double] = CommandList(self._program), CommandList(self._steps[double])
-        sums, step = lists = self._lists[stage, double]
-        key = self._workspace.pool.generation, replayed, tolerance, stage_arguments | {"min_bin": 0}
-        if sums.key == key:
-            sums.set({"min_bin": stage_arguments["min_bin"]})
-            return lists
-        sums.clear()
-        step.clear()
-        groups = self._groups(stage_arguments, False)
-        args = self._sum_arguments(stage_arguments, replayed.images[0], fit, groups, sums)
-        args |= replayed.arguments(groups, self._scratch("totals", 4 * (_GROUP_FLOATS + 1)))
-        args |= {"state": self._scratch("state", 4 * _STATE), "tolerance": tolerance}
-        args |= {"focal": max(args["focal_x"], args["focal_y"]), "pose": self._scratch("pose", 8 * 15)}
-        self._launch("align_errors", *self._size(self._rows(stage_arguments["height"])), args, sums)
-        self._launch("align_sums", *self._size(groups), args, sums)
-        self._launch("align_totals", (256,), (256,), args, sums)
-        self._launch("align_step", (1,), (1,), args, step)
-        sums.key = self._workspace.pool.generation, *key[1:]
-        return lists
+    def _minimise(
+        self,
+        at: Estimate,
+        steps: Sequence[tuple[int, int]],
+        replayed: _Replayed,
+        stage_commands: list[_StageCommands],
+        score_commands: _StageCommands | None,
+    ) -> tuple[np.ndarray, np.ndarray, Score | None]:
+        """Submit all frames of some stages and of a score, then read the buffer `state`, the pose and the
+        score."""
+        queue, channels, exposure_known = self._queue, len(at.fit.gain), at.noise > 0
+        state = np.zeros(_STATE, np.float32)
+        state[:8] = _packed_fit(at.fit)
+        state[_CONVERGED], state[_EXPOSURE_KNOWN] = 1, exposure_known
+        self._copy(stage_commands[0].state, state)
+        before = self._upload("first pose", replayed.packed(at.pose))
+        self._clear_errors()
+        for (_, limit), commands in zip(steps, stage_commands, strict=True):
+            commands.steps.set({"before": before})
+            commands.steps.submit(queue, 0, 1)
+            before = replayed.view
+            for step in range(limit if exposure_known else limit + 1):
+                # wait only where convergence is likely, so that frames are submitted while the device works
+                if (
+                    step >= (_FEW if limit >= 2 * _FEW else 1)
+                    and self._read(commands.state, (_READ,))[_CONVERGED]
+                ):
+                    break
+                # the first sums only determine the exposure, if it is unknown: the pose stays the same
+                if exposure_known or step != 1:
+                    replayed.submit()
+                commands.sums[0].submit(queue)
+                commands.steps.submit(queue, 1, 2)
+                queue.flush()
+            exposure_known = True
+        score = None
+        if (commands := score_commands) is not None:
+            commands.steps.set({"before": before})
+            commands.steps.submit(queue, 0, 1)
+            for step, sums in enumerate(commands.sums, 1):
+                replayed.submit(perturbed=step > 1)
+                sums.submit(queue)
+                commands.steps.submit(queue, step, step + 1)
+                queue.flush()
+            score = self._read_score(commands, channels)
+        state = self._read(stage_commands[0].state, (_READ,))
+        # a score leaves its pose in `pose`; the last step is in the view
+        source = replayed.view if score_commands is None else score_commands.pose
+        return state, replayed.world_to_camera(self._read(source, (_POSE,), replayed.record.dtype)), score
+
+    def _read_score(self, commands: _StageCommands, channels: int) -> Score:
+        packed = self._read(commands.result, (commands.groups, _GROUP_FLOATS))
+        rows = self._read(commands.totals, (len(commands.sums), _GROUP_FLOATS - 1))
+        sums, derivatives, stage = _unpacked(packed, channels, True, False), {}, len(self._stages) - 1
+        for axis, row in zip(self.axes(stage), rows[1:], strict=True):
+            rhs = _unpacked(np.append(row, 0)[None], channels, False, True).rhs
+            derivatives[axis] = rhs / self.motion_size(stage, axis, sums)
+        return Score(sums, derivatives)
+
+    def _step_commands(
+        self, stage: int, replayed: _Replayed, channels: int, tolerance: float
+    ) -> _StageCommands:
+        """Commands of Levenberg-Marquardt at a stage."""
+        args, groups = self._stage_arguments[stage], self._groups(self._stage_arguments[stage], False)
+        commands, is_recorded = self._stage_commands(("steps", stage), replayed, (tolerance, channels), 1)
+        if not is_recorded:
+            args = self._replayed_arguments(args, replayed, channels, True, groups) | {"axis": STEP}
+            args |= {"tolerance": tolerance, "row": 0}
+            sums, grid = commands.sums[0], (-(-args["width"] // 64) * 64, args["height"])
+            if args["reduced"] is not None:
+                own = {"channels": 3, "image": replayed.images[False]["rgb_out"], "result": args["reduced"]}
+                self._launch("align_downsample", grid, (64, 1), args | own, sums)
+            self._launch("align_errors", *self._errors_size(args), args, sums)
+            self._launch("align_sums", *self._sums_size(groups, channels), args, sums)
+            self._launch("align_start", (1,), (1,), args, commands.steps)
+            self._launch("align_step", (BINS,), (BINS,), args, commands.steps)
+            commands.bind(args)
+            commands.steps.key = self._workspace.pool.generation, *commands.steps.key[1:]
+        return commands
+
+    def _score_commands(self, stage: int, replayed: _Replayed, channels: int) -> _StageCommands:
+        """Commands of the score: sums of the frame by blocks, and of the perturbed frames."""
+        args, axes = self._stage_arguments[stage], (*self.axes(stage), 6)
+        commands, is_recorded = self._stage_commands(("score", stage), replayed, (channels,), len(axes))
+        if is_recorded:
+            return commands
+        groups = self._groups(args, True)
+        args = self._replayed_arguments(args, replayed, channels, False, groups) | {"tolerance": 0.0}
+        args["result"] = self._scratch("block sums", 4 * groups * _GROUP_FLOATS)
+        commands.bind(args)
+        self._launch("align_start", (1,), (1,), args, commands.steps)
+        for row, (axis, sums) in enumerate(zip(axes, commands.sums, strict=True)):
+            if row:
+                image = replayed.images[True]["rgb_out"]
+                args["perturbed"] = self._blurred(image, args, "perturbed frame", 3, sums)
+                groups = self._groups(args, False)
+                args |= {"has_perturbed": 1, "axis": axes[row - 1] % 3, "groups": groups}
+                args["result"] = self._scratch("sums", 4 * groups * _GROUP_FLOATS)
+            else:
+                self._launch("align_errors", *self._errors_size(args), args, sums)
+            self._launch("align_sums", *self._sums_size(groups, channels), args, sums)
+            self._launch("align_step", (BINS,), (BINS,), args | {"axis": axis, "row": row}, commands.steps)
+        commands.steps.key = self._workspace.pool.generation, *commands.steps.key[1:]
+        return commands
+
+    def _stage_commands(
+        self, name: tuple[str, int], replayed: _Replayed, parameters: tuple[Any, ...], count: int
+    ) -> tuple[_StageCommands, bool]:
+        """Cached commands, and whether they are recorded; `count` lists of sums. parameters: values of kernel
+        arguments."""
+        double = replayed.record.dtype == np.float64
+        if double not in self._step_programs:
+            self._step_programs[double] = Program(self._workspace, assemble_alignment_step(double))
+        cached = self._lists.get((*name, double))
+        key = self._workspace.pool.generation, replayed, parameters, self._stage_arguments[name[1]]
+        if cached is not None and cached.steps.key == key:
+            return cached, True
+        sums = [CommandList(self._program) for _ in range(count)]
+        commands = _StageCommands(sums, CommandList(self._step_programs[double]))
+        commands.steps.key = key
+        self._lists[(*name, double)] = commands
+        return commands, False
+
+    def _replayed_arguments(
+        self, args: dict[str, Any], replayed: _Replayed, channels: int, huber: bool, groups: int
+    ) -> dict[str, Any]:
+        """Arguments of all kernels of a step."""
+        image, depth = (replayed.images[False][name] for name in ("rgb_out", "depth_out"))
+        camera, reduced = self._stages[-1].camera, None
+        if (args["width"], args["height"]) != (camera.width, camera.height):
+            image = reduced = self._scratch("reduced render", 12 * args["width"] * args["height"])
+        args = self._sum_arguments(args, image, depth, channels, huber, groups)
+        args |= {"full_width": camera.width, "full_height": camera.height, "is_uint8": 0, "reduced": reduced}
+        args |= {"ratio_x": camera.width / args["width"], "ratio_y": camera.height / args["height"]}
+        args["depth_width"] = camera.width
+        state = self._scratch("state", 4 * _STATE)
+        args |= {"fit": state, "state": state, "pose": self._scratch("pose", 8 * _POSE), "groups": groups}
+        args |= {"totals": self._scratch("totals", 4 * 7 * _GROUP_FLOATS), "before": args["pose"]}
+        args |= {"damping": DAMPING, "difference": DIFFERENCE, "focal": max(args["focal_x"], args["focal_y"])}
+        return args | replayed.arguments()
+
+    def _read(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+        """Read the beginning of a buffer."""
+        values = np.empty(shape, dtype)
+        cl.enqueue_copy(self._queue, values, buffer)
+        return values
+
+    def _copy(self, buffer: cl.Buffer, array: np.ndarray) -> None:
+        """Copy an array to the beginning of a buffer without waiting."""
+        self._uploads.append(cl.enqueue_copy(self._queue, buffer, array, is_blocking=False))
 
     def _groups(self, args: dict[str, Any], blocks: bool) -> int:
         """Number of work-groups of the sums; with `blocks` one for each block."""
@@ -283,19 +413,23 @@ class OpenCLAlignment(AlignmentKernels):
     def _sum_arguments(
         self,
         args: dict[str, Any],
-        frame: Any,
-        fit: AlignmentFit,
+        rendered: cl.Buffer,
+        depth: cl.Buffer,
+        channels: int,
+        huber: bool,
         groups: int,
-        commands: CommandList | None = None,
     ) -> dict[str, Any]:
-        """Arguments of `align_errors` and `align_sums` for a frame; submits its blur."""
-        values = self._blurred(frame.images.buffer("rgb"), args, "render", 3, commands)
+        """Arguments of `align_errors` and `align_sums` for an image and its depth."""
+        blurred = rendered
+        if args["radius"]:
+            blurred = self._scratch("blurred render", 12 * args["width"] * args["height"])
         return args | {
-            **{"rgb": values, "depth": frame.images.buffer("depth"), "perturbed": values},
-            **{"has_perturbed": 0, "step": 1.0, "axis": 0, "huber": int(fit.huber), "row": 0},
-            **{"counts": self._errors(), "fit": self._scratch("fit", 28)},
-            **{"result": self._scratch("sums", 4 * groups * _GROUP_FLOATS)},
-            "noise_factor": noise_factor(len(fit.gain)),
+            **{"rendered": rendered, "rgb": blurred, "depth": depth, "perturbed": blurred},
+            **{"has_perturbed": 0, "step": 1.0, "axis": 0, "huber": int(huber)},
+            **{"depth_width": args["width"], "ratio_x": 1.0, "ratio_y": 1.0},
+            "counts": self._errors(),
+            "result": self._scratch("sums", 4 * groups * _GROUP_FLOATS),
+            "noise_factor": noise_factor(channels),
         }
 
     def _errors(self) -> cl.Buffer:
@@ -303,14 +437,8 @@ class OpenCLAlignment(AlignmentKernels):
         return self._scratch("errors", 4 * BINS)
 
     def _clear_errors(self) -> None:
-        """Clear the histogram of residuals, to which `align_errors` adds; `align_totals` clears it too."""
+        """Clear the histogram of residuals, to which `align_errors` adds; a step clears it too."""
         cl.enqueue_fill_buffer(self._queue, self._errors(), _ZERO, 0, 4 * BINS)
-
-    def _upload_fit(self, fit: AlignmentFit) -> cl.Buffer:
-        values = np.ones(7, np.float32)
-        for first, numbers in ((0, fit.gain), (3, fit.offset), (6, [fit.noise])):
-            values[first : first + len(numbers)] = numbers
-        return self._upload("fit", values)
 
     @property
     def _queue(self) -> cl.CommandQueue:
@@ -341,8 +469,13 @@ class OpenCLAlignment(AlignmentKernels):
             image = result
         return image
 
-    def _by_groups(self, kernel: str, groups: int, args: dict[str, Any]) -> None:
-        self._launch(kernel, *self._size(groups), args)
+    def _errors_size(self, args: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        spans = -(-args["width"] * args["height"] // (2 * self._items))
+        return self._size(min(spans, 4096 if self._items > 1 else _GROUPS[1]))
+
+    def _sums_size(self, groups: int, channels: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """On GPUs each work-group sums one channel."""
+        return self._size(groups * (channels if self._items > 1 else 1))
 
     def _size(self, groups: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         return (groups * self._items,), (self._items,)
@@ -375,17 +508,17 @@ class OpenCLAlignment(AlignmentKernels):
         return buffer
 
 
-class _ReplayedImages:
-    """Images of a replayed frame. `images` is the object itself, so that it replaces a Frame.
+class _StageCommands:
+    """Command lists of a stage: the sums of a frame, or of a frame and of each perturbed frame; `align_start`
+    and the steps."""
 
-    owner: object that owns the image buffers; they return to the pool when it is released.
-    """
+    def __init__(self, sums: list[CommandList], steps: CommandList) -> None:
+        self.sums, self.steps = sums, steps
 
-    def __init__(self, named: dict[str, cl.Buffer], owner: Any = None) -> None:
-        self.named, self.images, self._owner = named, self, owner
-
-    def buffer(self, name: str) -> cl.Buffer:
-        return self.named[f"{name}_out"]
+    def bind(self, args: dict[str, Any]) -> None:
+        """Set the buffers that the host reads, from arguments of the kernels."""
+        self.state, self.pose, self.totals = args["state"], args["pose"], args["totals"]
+        self.result, self.groups = args["result"], args["groups"]
 
 
 class _Replayed:
@@ -400,19 +533,16 @@ class _Replayed:
         perturbed: dict[str, cl.Buffer],
     ) -> None:
         """owner: object that owns the image buffers; they return to the pool when it is released. perturbed:
-        buffers of the images of `PerturbedFrame`."""
+        buffers of the images of perturbed frames."""
         pool = workspace.pool
-        self._workspace, self._recorded, self._origin = workspace, frame.recorded, origin
-        self.record = view_records(frame.batch, 0, frame.rows, frame.source.records["View"])
+        self._workspace, self._recorded, self._origin, self._owner = workspace, frame.recorded, origin, owner
         self._template = frame.view
-        rotation, commands = frame.source.uniform_groups.get("rotation", {}), frame.commands
-        self._rotation = [(at, index) for index, name in rotation.items() for at in commands.positions(name)]
-        """arguments that depend on the rotation, with indices of its elements"""
+        self.record = view_records(frame.batch, 0, frame.rows, frame.source.records["View"])
+        self.record.flags.writeable = False  # so that `BufferPool.upload` copies the record once
         self._counts = frame.acquired["frame_counts"]
         own = {f"{name}_out": frame.acquired[f"{name}_out"] for name in ("rgb", "depth")}
-        self.images = _ReplayedImages(own, owner), _ReplayedImages(perturbed)
+        self.images = own, perturbed
         self._generation, self._number = pool.generation, -1
-        self.view = pool.scratch("view", self.record.nbytes)
 
     @classmethod
     def of(
@@ -429,57 +559,56 @@ class _Replayed:
             )
             for output in pipeline.outputs.values()
         }
-        frame = pipeline.replay_undivided(cloud, view, 0)
+        workspace.pool.scratch(_name_of(view), pipeline.source.records["View"].itemsize)
+        # a limit that no other caller gives, as the buffer of the view is its own
+        frame = pipeline.replay_undivided(cloud, view, sys.maxsize)
         owner = pipeline.images_of(frame)
         replayed = None if frame.recorded is None else cls(workspace, frame, owner, origin, scratch)
         return replayed if replayed is not None and replayed.bind() else None
 
     def bind(self) -> bool:
         """Restore the buffers that other frames have overwritten; False if a buffer was replaced."""
-        workspace = self._workspace
+        workspace, queue = self._workspace, self._queue
         if workspace.pool.generation is not self._generation:
             return False
         if workspace.frames != self._number:
-            if not self._recorded.set_view(self._template, self._queue):
+            if not self._recorded.set_view(self._template, queue):
                 return False
-            # `align_step` overwrites this buffer: after `scratch`, the next `upload` copies the view again
-            self.view = workspace.pool.scratch("view", self.record.nbytes)
-            self._recorded.commands.set({"frame_counts": self._counts})
+            # kernels overwrite its pose; another capture overwrites all of it
+            self.view, self._upload = workspace.pool.upload(queue, _name_of(self._template), self.record)
+            self._recorded.commands.set({"frame_counts": self._counts, "view": self.view})
         return True
 
-    def arguments(self, groups: int, totals: cl.Buffer) -> dict[str, Any]:
-        """Arguments of `align_totals` and `align_step`."""
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of the kernels of alignment_step.cl."""
         capacity = self._recorded.capacity
         return {
-            **{"groups": groups, "totals": totals, "frame_counts": self._counts, "view": self.view},
+            **{"frame_counts": self._counts, "view": self.view, "near": self._template.near},
             **{"big_capacity": capacity.big, "pair_capacity": capacity.pairs},
         }
 
-    def set_pose(self, pose: np.ndarray) -> None:
-        rotation, record = pose[:3, :3], self.record.copy()
+    def packed(self, pose: np.ndarray) -> np.ndarray:
+        """Rotation, translation and eye of a view (15,)."""
+        rotation, packed = pose[:3, :3], np.empty(_POSE, self.record.dtype)
         eye = -rotation.T @ pose[:3, 3] - self._origin
-        record[:9], record[9:12], record[12:15] = rotation.ravel(), -rotation @ eye, eye
-        self._upload = cl.enqueue_copy(self._queue, self.view, record, is_blocking=False)
-        self.set_rotation(record)
+        packed[:9], packed[9:12], packed[12:] = rotation.ravel(), -rotation @ eye, eye
+        return packed
 
-    def set_rotation(self, rotation: np.ndarray) -> None:
-        """Set the kernel arguments that depend on the rotation (9,), as of an environment map."""
-        if self._rotation:
-            values = rotation.tolist()
-            for (command, argument), index in self._rotation:
-                command.bind(argument, values[index])
+    def set_pose(self, pose: np.ndarray) -> None:
+        """Set the pose; without a step, the near plane is that of the view."""
+        record = self.record.copy()
+        record[:_POSE] = self.packed(pose)
+        self._upload = cl.enqueue_copy(self._queue, self.view, record, is_blocking=False)
 
     def submit(self, perturbed: bool = False) -> None:
         commands = self._recorded.commands
-        commands.set(self.images[perturbed].named)
+        commands.set(self.images[perturbed])
         self._workspace.frames = self._number = self._workspace.frames + 1
-        self._events = commands.submit(self._queue)
+        commands.submit(self._queue)
 
     def is_complete(self) -> bool:
         """Whether the lists of the last frame were large enough; waits for its counts."""
-        self._queue.flush()
-        counted = self._events[self._recorded.launches_until_counts - 1]
-        return self._recorded.capacity.holds(Counts.read(self._workspace.side_queue, self._counts, [counted]))
+        return self._recorded.capacity.holds(Counts.read(self._queue, self._counts))
 
     def world_to_camera(self, numbers: np.ndarray) -> np.ndarray:
         """(4, 4) pose from a view's rotation and translation."""
@@ -491,6 +620,19 @@ class _Replayed:
     @property
     def _queue(self) -> cl.CommandQueue:
         return self._workspace.switch_to(self._workspace.replay_queue)
+
+
+def _name_of(view: View) -> str:
+    """Name of the buffer of a view."""
+    return f"alignment: view {view.width} x {view.height}"
+
+
+def _packed_fit(fit: AlignmentFit) -> np.ndarray:
+    """(8,) float32: gain and offset of three channels, noise, and whether the stage has converged."""
+    values = np.ones(8, np.float32)
+    for first, numbers in ((0, fit.gain), (3, fit.offset), (6, [fit.noise, 0])):
+        values[first : first + len(numbers)] = numbers
+    return values
 
 
 def _unpacked(packed: np.ndarray, channels: int, blocks: bool, perturbed: bool) -> AlignmentSums:

@@ -326,9 +326,9 @@ def assemble_alignment(items: int) -> KernelSource:
 
 @cache
 def assemble_alignment_step(float64: bool) -> KernelSource:
-    """Assemble the kernel of a step of Levenberg-Marquardt, for views in float64 or float32."""
+    """Assemble the kernels of steps of Levenberg-Marquardt, for views in float64 or float32."""
     constants = {
-        **{"PROJECTION_FP64": int(float64)},
+        **{"PROJECTION_FP64": int(float64), "STEP": f"({alignment.STEP})"},
         **{name: f"{getattr(alignment, name)}f" for name in ("MIN_GAIN", "MAX_GAIN")},
     }
     scalar_types = ScalarTypes("double" if float64 else "float", "float")

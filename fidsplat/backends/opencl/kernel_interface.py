@@ -126,9 +126,10 @@ _LOSS_SIZE = args(
 )
 _MASK = args("int masked", "in uchar mask  // (rows, pixels), where `masked`")
 _ALIGNED = args(
-    *("int width height channels", "uint min_bin  // lowest histogram bin that is used"),
-    "in float fit  // gain, then offset of three channels, noise at the previous pose or 0",
-    *("in uchar bins  // histogram bins of gradient magnitudes", "in float image rgb"),
+    "int width height channels stage",
+    "in uint thresholds  // lowest histogram bin to use of each stage; then see `align_thresholds`",
+    "in float fit  // gain, then offset of three channels, previous noise or 0, whether converged",
+    *("in uchar bins  // histogram bins of gradient magnitudes", "in float image"),
 )
 _IMAGES = args("out float images")
 _SURFACE = args(
@@ -208,9 +209,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "accumulate": args(_ACCUMULATED, "float weight", "int first", "in float raw", "out float accumulated"),
     "copy_middle": args(_ACCUMULATED, "in uint raw", "out uint accumulated"),
     "composite_background": args(
-        *(_SIZE, "int stride", "uint channel_stride", RAY_UNIFORMS),
-        uniforms("rotation", _ROTATION, note="world to camera"),
-        "out float raw",
+        *(_SIZE, "int stride", "uint channel_stride", RAY_UNIFORMS, "in View view", "out float raw"),
     ),
     "resolve": args(
         "int width height  // of the image",
@@ -296,8 +295,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     # direct image alignment
     "align_downsample": args(
-        *("int width height channels full_width full_height", "float ratio_x ratio_y"),
-        *("in float image", "out float result"),
+        *("int width height channels full_width full_height is_uint8", "float ratio_x ratio_y"),
+        *("in uchar bytes", "in float image", "out float result"),
     ),
     "align_blur": args(
         "int width height channels vertical radius",
@@ -305,25 +304,36 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in float image", "out float result"),
     ),
     "align_texture": args(
-        *("int width height channels row", _MASK, "in float image", "out uchar bins"),
-        "out uint counts  // (stages, BINS); row: index of the stage",
+        *("int width height channels stage", _MASK, "in float image", "out uchar bins"),
+        "out uint counts  // (stages + 1, BINS)",
     ),
-    "align_errors": args(_ALIGNED, "out uint counts  // (BINS)"),
+    "align_noise": args("int width height channels stage", "in float image", "out uint counts"),
+    "align_thresholds": args(
+        *("int stages", "uint max_pixels", "out uint counts"),
+        "out uint thresholds  // lowest bin and pixels of each stage; then bits of a float, a median",
+    ),
+    "align_errors": args(
+        *(_ALIGNED, "int radius", "in float taps rendered", "out float rgb", "out uint counts  // (BINS)")
+    ),
     "align_sums": args(
-        _ALIGNED,
-        "in uint counts",
+        *(_ALIGNED, "in float rgb", "in uint counts"),
         "int block_size huber has_perturbed axis lens  // has_perturbed: whether `perturbed` is given",
-        "float focal_x focal_y center_x center_y noise_factor step",
+        "int depth_width",
+        "float focal_x focal_y center_x center_y noise_factor step ratio_x ratio_y",
         "in float depth rays perturbed",
         "out float result  // (work-groups, SUMS + 1)",
     ),
-    "align_totals": args(
-        *("int groups", "uint big_capacity pair_capacity", "in float result", "in uint frame_counts"),
-        *("out uint counts", "out float totals  // (SUMS + 2)"),
+    "align_start": args(
+        "real near", "float damping", "in real before", "out float state", "out real pose", "out View view"
     ),
     "align_step": args(
-        *("int channels", "float focal tolerance  // pixels: a smaller motion has converged"),
-        *("in float totals", "out float fit state", "out real pose view  // pose: the last accepted"),
+        *(
+            "int groups channels axis row  // axis: of the next motion, or STEP",
+            "uint big_capacity pair_capacity",
+        ),
+        "float focal tolerance difference  // pixels: a smaller motion has converged; size of a motion",
+        *("in float result", "in uint frame_counts", "out uint counts", "out float totals  // (rows, SUMS)"),
+        *("out float state", "out real pose  // the last accepted", "out View view"),
     ),
     # training
     "loss_load": args(

@@ -11,9 +11,10 @@ kernel void composite_background(
     float ray_x = ((float)x + 0.5f - ray_center_x) / ray_focal_x;
     float ray_y = ((float)y + 0.5f - ray_center_y) / ray_focal_y, ray_z = 1.0f;
 //@@ background_ray
-    float world_x = FMA(rotation_00, ray_x, FMA(rotation_10, ray_y, rotation_20 * ray_z));
-    float world_y = FMA(rotation_01, ray_x, FMA(rotation_11, ray_y, rotation_21 * ray_z));
-    float world_z = FMA(rotation_02, ray_x, FMA(rotation_12, ray_y, rotation_22 * ray_z));
+    global const real *r = view->rotation;
+    float world_x = FMA((float)r[0], ray_x, FMA((float)r[3], ray_y, (float)r[6] * ray_z));
+    float world_y = FMA((float)r[1], ray_x, FMA((float)r[4], ray_y, (float)r[7] * ray_z));
+    float world_z = FMA((float)r[2], ray_x, FMA((float)r[5], ray_y, (float)r[8] * ray_z));
     float behind[3];
 //@@ background
     float transmittance = raw[3 * (size_t)channel_stride + at];
