@@ -6,7 +6,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_pose
 from fidsplat.capture.capture import Capture
 from fidsplat.util.errors import InputError
-
-if TYPE_CHECKING:
-    from fidsplat.backends.interface import Backend
 
 BINS, SHIFT, FIRST_BIN = 256, 19, 113 << 4
 """bins of the histograms of gradient magnitudes and residuals, positive float32: 16 per octave from 2^-14 to
@@ -67,7 +64,8 @@ class Estimate(NamedTuple):
 class RenderedScene:
     """A scene that is rendered for alignment."""
 
-    backend: Backend
+    backend: Any
+    """the Backend that renders it"""
     splats: Any
     """the cloud, for `prepare`"""
     cloud: Any
