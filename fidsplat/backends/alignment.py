@@ -91,8 +91,9 @@ class PerturbedFrame(NamedTuple):
     size: float
     """size of the motion [rad or m]"""
     axis: int
-    """index (0 or 1) of a component r of the ray: with d the derivative with respect to this motion, the
-    derivative with respect to the motion along (or about) z is -r d"""
+    """component (0: x, 1: y) of the motion, and of the pixel's ray (x, y, 1). With d the derivative with
+    respect to this motion and r the component of the ray, -r d is a part of the derivative with respect to
+    the motion along (or about) z"""
 
 
 @dataclass(frozen=True, eq=False)

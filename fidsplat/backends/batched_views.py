@@ -42,7 +42,7 @@ class ViewBatch:
     """(v,) uint32: position of each view in the batch"""
     total: int = 1
     views: tuple[View, ...] = ()
-    """the views, if they differ from `view` in more than their poses"""
+    """the rendered views; empty for a batch of poses (`of_poses`), where `view_at` makes them"""
     same_uniforms: bool = True
     """whether the views differ only in poses and `camera_parameters`; if not, they are rendered one by one"""
 

@@ -1,4 +1,4 @@
-"""Temporary folders for compiled kernels if the caches of PoCL, pyopencl or Warp are not writable."""
+"""Temporary folders for compiled kernels if the caches of PoCL, pyopencl or Warp cannot be used."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def pocl_folder() -> Path:
 
 @cache
 def ensure_caches() -> None:
-    """Set a temporary folder, with a warning, for each cache that is not writable, is nearly full, or belongs
-    to another user. Called before the first use of a driver."""
+    """Set a temporary folder, with a warning, for each cache that is not writable, is nearly full, belongs to
+    another user, or can be written by every user. Called before the first use of a driver."""
     if "HOME" not in os.environ and "XDG_CACHE_HOME" not in os.environ:  # PoCL would use a folder in /tmp
         os.environ.setdefault("POCL_CACHE_DIR", str(user_cache() / "pocl" / "kcache"))
     where = {"POCL_CACHE_DIR": pocl_folder(), "XDG_CACHE_HOME": user_cache()}

@@ -27,8 +27,11 @@ class DeviceInfo:
     name: str
     """value of `device=` that opens this device"""
     title: str
+    """name of the device in its driver"""
     platform: str
+    """name of the OpenCL platform, or of the library that renders"""
     version: str
+    """version of the driver or library"""
     kind: str
     """`cpu`, `gpu` or `other`"""
     compute_units: int
@@ -114,8 +117,8 @@ class Images(ABC):
 
     @abstractmethod
     def read(self, name: str, index: int | None = None) -> np.ndarray:
-        """Copy images to the host, in the type of `OUTPUTS[name]`: (views, h, w) or (views, h, w, channels),
-        or one view without the first axis if `index` is given."""
+        """Copy images to the host, in the type of `declared_output(name)`: (views, h, w) or
+        (views, h, w, channels), or one view without the first axis if `index` is given."""
 
     def read_float64(self, name: str, index: int | None = None) -> np.ndarray:
         """Copy images to the host in float64; unrounded if the device computes in float64."""

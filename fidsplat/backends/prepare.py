@@ -22,9 +22,9 @@ _prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[CloudLike, _Prepared]] =
 
 
 def prepare(cloud: CloudLike, capture: Capture) -> _Prepared:
-    """The features that a capture of a cloud requires, and its view; cached for uploaded clouds. Raises
-    InputError for a missing camera, an unknown output, effects that exclude each other, or a pose that is not
-    rigid."""
+    """The features that a capture of a cloud requires, and its view; cached for uploaded clouds and stores.
+    Raises InputError for a missing camera, an unknown output, effects that exclude each other, or a pose that
+    is not rigid."""
     if isinstance(cloud, SplatCloud) or not capture.motion.is_still:
         view = view_of(capture, cloud.origin)
         return select(cloud, capture), view

@@ -54,7 +54,7 @@ class View:
     samples: int
     """samples per pixel along each axis"""
     focal_x: float
-    """samples per unit of x / z (pinhole), per radian (panorama) or per metre (parallel rays)"""
+    """samples per unit of x / z (pinhole), per radian (fisheye, panorama) or per metre (parallel rays)"""
     focal_y: float
     center_x: float
     """samples: principal point"""
@@ -66,7 +66,9 @@ class View:
     eye: np.ndarray
     """(3,) metres: camera centre minus the cloud's origin; far behind the camera for parallel rays"""
     near: float
+    """metres: minimum depth of a fragment"""
     far: float
+    """metres: splats that are completely deeper are culled"""
     log_alpha_cutoff: float
     """natural logarithm of the alpha cut-off, rounded to float32"""
     opacity_ceiling: float
@@ -76,7 +78,8 @@ class View:
     background: tuple[float, float, float]
     """background colour; with fog, the fog's colour"""
     first_hit_transmittance: float
-    """transmittance behind which a fragment is the first hit of a pixel, the output `depth_first`"""
+    """threshold of `depth_first`: the first fragment behind which the transmittance is at most this value is
+    the first hit of a pixel"""
     sensor: Sensor = _NO_SENSOR
     fog_density: float = 0.0
     """fog density per metre"""

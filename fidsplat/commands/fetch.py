@@ -1,4 +1,4 @@
-"""`fidsplat fetch`."""
+"""Command `fidsplat fetch`: download captured scenes."""
 
 from __future__ import annotations
 

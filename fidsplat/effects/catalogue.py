@@ -75,7 +75,7 @@ _WITHOUT_OUTPUT = (
     *("background_constant", "background_gradient", "background_panorama"),
     *("arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"),
     # optional
-    *("external_depth", "motion_groups", "shutter_exposure", "shutter_rows", "blend_double"),
+    *("external_depth", "motion_groups", "shutter_exposure", "sub_frame_culling", "blend_double"),
     "blend_half",
     "termination_depths",
     # steps after blending

@@ -103,7 +103,7 @@ def select(cloud: CloudProperties, capture: Capture) -> FeatureSet:
             f"arithmetic_{'precise' if double else 'approximate' if half else quality.arithmetic}",
             *(("motion_groups",) if capture.motion.groups else ()),
             *(("shutter_exposure",) if capture.has_sub_frames else ()),
-            *(("shutter_rows",) if capture.has_sub_frames and bounded_by_spheres else ()),
+            *(("sub_frame_culling",) if capture.has_sub_frames and bounded_by_spheres else ()),
             *(("blend_double",) if double else ("blend_half",) if half else ()),
         ),
         outputs=tuple(sorted({*capture.outputs} - {"rgb", *DERIVED_OUTPUTS})),

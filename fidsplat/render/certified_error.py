@@ -25,14 +25,17 @@ where the first term is measured, for any requested quality, and the second is b
 4. Rounding T changes the colour behind a fragment by at most 2^-24 T C. Rounding the colour sum changes it by
    at most 2^-24 (1 - T) C. C is the largest absolute colour. Both together change it by at most 2^-24 C per
    fragment. Rounding the products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a
-   pixel together. The sum for m fragments is (m + 2) 2^-24 C: `rounding` contains 1.5 per fragment, and
-   `error_reference` adds 2. It also adds 2^-24 C for each rounding of the sums over samples, over sub-frames
-   (the camera poses that a shutter averages) and over spherical harmonics.
+   pixel together. The sum for m fragments is (m + 2) 2^-24 C. The kernels add 1.5 instead of 1 per
+   fragment, as a margin for second-order terms, to `rounding`; `error_reference` adds the 2. It also adds
+   2^-24 C for each rounding of the sums over samples, over sub-frames (the camera poses that a shutter
+   averages) and over spherical harmonics.
 
 R and C are bounded by the colours of all splats and of the background. Q is composited in float64 if an
 effect is not in `_BOUNDED` or rgb is composited in float64. Then only the conversion of its image to float32
-is rounded. The bound excludes the rounding of the float64 projection and, with order="pixel", the order of
-two fragments whose depths differ by less than float64's rounding.
+is rounded. Fog, sensors and a finite `far` have no bound on any device, and gradient and panorama backgrounds
+only on the reference device: `error_reference` raises InputError for them. The bound excludes the rounding of
+the float64 projection and, with order="pixel", the order of two fragments whose depths differ by less than
+float64's rounding.
 """
 
 from __future__ import annotations

@@ -22,14 +22,16 @@ class Frame(ImageMapping):
     device on first use.
 
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
-    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
-    unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
-    (h, w) int32, of the fragment with the largest weight; `blended` (h, w) int32, number of composited
-    splats; `error` (h, w), an upper bound of |rgb - ideal| (fidsplat/render/certified_error.py).
-    `depth_median` is the depth of the last fragment in front of which the transmittance is above one half,
-    `depth_first` that of the first fragment at which the accumulated opacity reaches `Quality.first_hit`
-    (docs/rendering.md has the definitions). In pixels with an alpha below 1/255 (`_first` outputs: below
-    `first_hit`) `label` and `splat_id` are -1, and depths, distances and normals are 0.
+    metres along z (fisheyes and panoramas: along the ray); `distance`, `distance_median`, `distance_first`
+    metres along the ray; `normal` (h, w, 3) unit, camera frame, towards the camera, `normal_world` the same
+    in the world's axes; `label`, `splat_id` (h, w) int32, of the fragment or coplanar layer with the largest
+    weight; `blended` (h, w) int32, number of composited splats; `error` (h, w), an upper bound of
+    |rgb - ideal| (fidsplat/render/certified_error.py).
+    `depth_median` is the depth of the last fragment or layer in front of which the transmittance is above one
+    half, without fragments of weight below 1/255; `depth_first` is the depth of the first fragment or layer
+    at which the accumulated opacity reaches `Quality.first_hit` (docs/rendering.md has the definitions). In
+    pixels with an alpha below 1/255 (`_first` outputs: below `first_hit`) `label` and `splat_id` are -1, and
+    depths, distances and normals are 0.
     """
 
     _noun = "frame"

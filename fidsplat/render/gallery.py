@@ -52,8 +52,9 @@ def gallery_scene(source: Path, scene: Scene) -> GalleryScene:
 
 
 def write_gallery(folder: Path, scenes: Sequence[GalleryScene], device: str | None = None) -> Iterator[Path]:
-    """Render scenes into a folder and write index.html; yields each file when it is written. Unchanged scenes
-    are not rendered again.
+    """Render scenes into a folder and write index.html. Unchanged scenes are not rendered again.
+
+    Yields the image of the first output of each scene when all of its images exist, then index.html.
 
     Args:
         device: replaces the devices of the scenes.

@@ -24,8 +24,8 @@ RESOLUTION = 200
 """voxels along the longest side of a scene"""
 _TINY = 1e-300
 """minimum length of a voxel [m]"""
-MAX_VOXELS = 1 << 20
-"""maximum number of voxels per side"""
+MAX_VOXELS = 1 << 19
+"""maximum number of voxels per side of a scene, far within the range of the keys of a DistanceField"""
 
 
 def scene_mesh(
@@ -55,10 +55,8 @@ def scene_mesh(
     voxel = (
         size / RESOLUTION if voxel is None else number("voxel", voxel, "a positive length in metres", _TINY)
     )
-    if size / voxel > MAX_VOXELS / 2:
-        raise InputError(
-            f"voxel must be at least {2 * size / MAX_VOXELS:.2g} m for this scene, got {voxel:g}"
-        )
+    if size / voxel > MAX_VOXELS:
+        raise InputError(f"voxel must be at least {size / MAX_VOXELS:.2g} m for this scene, got {voxel:g}")
     views = list(
         views_around(scene, low, high)
         if cameras is None

@@ -36,8 +36,8 @@ _ODDS_AT_RANGE = 9
 """odds of detection at `Lidar.detection_range`: 9 to 1, 90 %. Odds are proportional to signal^4: a third of
 the signal is detected with a probability of 10 %"""
 _ALPHA_CUTOFF = 1e-3
-"""minimum alpha of a fragment; fainter ones hardly change the distance at which the accumulated opacity
-reaches `Lidar.opacity`"""
+"""lower limit of the alpha cut-off of a scan: fainter fragments hardly change the distance at which the
+accumulated opacity reaches `Lidar.opacity`"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -252,7 +252,8 @@ class Store(Summarised):
         return self.poses[:, :3, :3] @ inner + self.poses[:, :3, 3] - outer
 
     def first_of(self, numbers: np.ndarray) -> np.ndarray:
-        """Index (k,) int64 of the first splat of chunks, by number; -1 for nodes of levels of detail."""
+        """Index (k,) int64 in the complete scene of the first splat of each node; -1 for merged splats (of
+        levels of detail). numbers: (k,) numbers of nodes."""
         instance, node = np.divmod(self._checked(numbers), max(len(self.nodes), 1))
         records = self.nodes[node]
         return np.where(records["level"] == 0, records["first"] + instance * self._own.splats, -1)

@@ -292,7 +292,7 @@ def test_only_pinhole_frames_of_several_poses_are_culled_by_spheres():
                 camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure_time=0.1 * exposed)
             ),
         )
-        assert ("shutter_rows" in chosen.names) == expected
+        assert ("sub_frame_culling" in chosen.names) == expected
         assert ("reach * sqrt(fy" in assemble(chosen, SHAPE).text) == expected
 
 

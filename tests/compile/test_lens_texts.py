@@ -25,7 +25,12 @@ CAMERAS = {
 
 LENS_FILES = {
     *("effect/camera_brown_conrady", "effect/camera_fisheye", "effect/camera_equirectangular"),
-    *("effect/camera_orthographic", "effect/shutter_exposure", "effect/shutter_rows", "effect/motion_groups"),
+    *(
+        "effect/camera_orthographic",
+        "effect/shutter_exposure",
+        "effect/sub_frame_culling",
+        "effect/motion_groups",
+    ),
     *(
         "part/rays",
         "part/inverse_lens_lut",

@@ -160,7 +160,7 @@ def test_many_views_share_a_motion_and_a_shutter(renderer):
 
 @pytest.mark.parametrize(("lowpass", "samples"), alternate({"screen": "screen", "none": "none"}, SAMPLES))
 def test_what_bands_leave_out_by_its_sphere_renders_nothing_there(renderer, lowpass, samples):
-    """The same bits with and without `shutter_rows`: near, behind, large and far below a pixel."""
+    """The same bits with and without `sub_frame_culling`: near, behind, large and far below a pixel."""
     cloud = random_splats(3000, 11, depth=(-2.0, 6.0), scale=(1e-4, 1.0), across=2.0)
     cloud = cloud.with_labels(np.arange(3000) % 7)
     cloud.opacities.flags.writeable = True
@@ -169,8 +169,10 @@ def test_what_bands_leave_out_by_its_sphere_renders_nothing_there(renderer, lowp
     camera, shutter = CAMERAS["pinhole"], fs.Shutter(readout=0.5, rows_per_band=3)
     capture = fs.Capture(camera, ALL_OUTPUTS, quality, BACKGROUND, MOTION, shutter)
     features, view = prepare(cloud, capture)
-    assert "shutter_rows" in features.names
-    without = replace(features, effects=tuple(name for name in features.effects if name != "shutter_rows"))
+    assert "sub_frame_culling" in features.names
+    without = replace(
+        features, effects=tuple(name for name in features.effects if name != "sub_frame_culling")
+    )
     backend = renderer.backend
     one, other = (
         backend.pipeline(each).render_view(backend.upload(cloud), view) for each in (features, without)

@@ -131,18 +131,18 @@ GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
         (CloudProperties(footprint="mixed"), {}, "lowpass_screen", "lowpass_none"),
         (CloudProperties(), {"motion": GROUP}, "motion_groups", "shutter_exposure"),
         (CloudProperties(), {"motion": MOVING}, "camera_pinhole", "shutter_exposure"),
-        (CloudProperties(), ROLLING, "shutter_rows", "motion_groups"),
-        (OF_BOXES, ROLLING, "shutter_exposure", "shutter_rows"),
+        (CloudProperties(), ROLLING, "sub_frame_culling", "motion_groups"),
+        (OF_BOXES, ROLLING, "shutter_exposure", "sub_frame_culling"),
         (
             CloudProperties(),
             ROLLING | {"quality": fs.Quality(lowpass="pixel")},
             "shutter_exposure",
-            "shutter_rows",
+            "sub_frame_culling",
         ),
-        (CloudProperties(), ROLLING | {"camera": PANORAMIC}, "shutter_exposure", "shutter_rows"),
+        (CloudProperties(), ROLLING | {"camera": PANORAMIC}, "shutter_exposure", "sub_frame_culling"),
         (CloudProperties(), {"quality": FLOAT64}, "arithmetic_precise", "arithmetic_fast"),
         (CloudProperties(), {"fog": fs.Fog(0.0)}, "background_constant", "fog"),
-        (CloudProperties(), {"fog": fs.Fog(0.1)}, "fog", "shutter_rows"),
+        (CloudProperties(), {"fog": fs.Fog(0.1)}, "fog", "sub_frame_culling"),
     ],
 )
 def test_a_scene_calls_for_what_it_needs_and_nothing_else(cloud, parts, called, not_called):

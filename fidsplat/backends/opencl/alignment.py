@@ -166,8 +166,8 @@ class OpenCLAlignment(AlignmentKernels):
     def _replay(self, pose: np.ndarray) -> _Replayed | None:
         """The replayed frames of the last stage. GPUs reduce them for the other stages: the pixels of smaller
         frames have more splats, which a work-item blends one by one. None if the frames cannot be replayed:
-        on CPUs, in chunks, for an empty cloud, with moving groups, a shutter or parallel rays. pose: any
-        valid pose."""
+        on CPUs, beyond the memory budget, for an empty cloud, with moving groups, a shutter or parallel rays.
+        pose: any valid pose."""
         camera, cloud = self._stages[-1].camera, self._scene.cloud
         sizes = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
         key = self._scene.capture, *sizes, camera.near, camera.far, camera.lens

@@ -182,7 +182,7 @@ def assemble(features: FeatureSet, config: KernelConfig) -> KernelSource:
     """Assemble the source of a feature set. Raises DeviceError if a file fills an unknown hook."""
     effects = effect_code_of(features)
     # blend and resolve are fused if a pixel has one sample and one pose, and no other kernel adds to it
-    separate = {"rays", "shutter_exposure", "shutter_rows"}
+    separate = {"rays", "shutter_exposure", "sub_frame_culling"}
     fused = features.samples == 1 and "background_constant" in effects and separate.isdisjoint(effects)
     files = [effect.file for effect in effects.values() if effect.file]
     files += _dialect(config, _scalar_types(features), features.effects)
@@ -251,9 +251,10 @@ def _frustum_parts(effects: Collection[str]) -> list[str]:
 
 def culls_before_projection(features: FeatureSet) -> bool:
     """Whether groups of splats in Morton order can be culled by bounding spheres. Not with the k-buffer,
-    which breaks ties by cloud order, nor with motion, where splats of a group may have different poses."""
+    which breaks ties by cloud order; nor with moving groups, where splats of a culling group may have
+    different poses; nor where single splats are culled against the rows of a sub-frame instead."""
     effects = effect_code_of(features)
-    excluded = {"order_pixel", "motion_groups", "shutter_rows"}
+    excluded = {"order_pixel", "motion_groups", "sub_frame_culling"}
     return excluded.isdisjoint(effects) and bool(_frustum_parts(effects))
 
 

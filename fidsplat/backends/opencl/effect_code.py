@@ -118,6 +118,7 @@ EFFECT_CODE: dict[str, EffectCode] = {
         parts=("ellipsoid_ewa",),
         backward_file="effect/ellipsoid_ewa_antialiased_backward.cl",
     ),
+    # EWA projects all splats to disks that face the camera: D = 1, and n_u does not depend on rows
     "ellipsoids_only": EffectCode(
         "effect/ellipsoids_only.cl",
         constant=(
@@ -163,7 +164,8 @@ EFFECT_CODE: dict[str, EffectCode] = {
         ),
     ),
     "shutter_exposure": EffectCode("effect/shutter_exposure.cl"),
-    "shutter_rows": EffectCode("effect/shutter_rows.cl"),
+    # bounding spheres of splats against the rows of a sub-frame
+    "sub_frame_culling": EffectCode("effect/sub_frame_culling.cl"),
     "blend_double": EffectCode(),
     "blend_half": EffectCode(
         "effect/blend_half.cl",
@@ -335,8 +337,8 @@ EFFECT_CODE: dict[str, EffectCode] = {
         project=args("cloud int splat_ids  // (n)"),
         sample_buffers=(SampleBuffer("float", "splat_id_raw"), SampleBuffer("int", "splat_id_index_raw")),
     ),
+    # internal: number of composited fragments, for `fidsplat bench`; rounding bound, for the output `error`
     "overdraw": EffectCode("output/overdraw.cl", sample_buffers=(SampleBuffer("int", "overdraw_raw"),)),
-    # bound of the rounding error, for the output `error`; number of composited splats
     "rounding": EffectCode("output/rounding.cl", sample_buffers=(SampleBuffer("float", "rounding_raw"),)),
     "blended": EffectCode("output/blended.cl", sample_buffers=(SampleBuffer("int", "blended_raw"),)),
     # effects on the resolved rgb

@@ -1,5 +1,5 @@
-"""Pinned (page-locked) host memory for images of a GPU: a copy to it runs at the full rate of the bus, during
-rendering.
+"""Pinned (page-locked) host memory for images of a GPU: copies to it use the full bandwidth of the bus and
+overlap with rendering.
 
 Pinning takes longer than copying, so memory is reused for images of about the same size.
 """

@@ -222,7 +222,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_gradients": args(
         *(
             _RESERVED,
-            "out uint big_rows  // (rows of tiles, big splats) tile_rank of column 0; add the column",
+            "out uint big_rows  // (rows of tiles, big splats) index of a tile in its splat minus its column",
         )
     ),
     "blend_backward": args(
@@ -235,7 +235,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
             "in uint gradient_offsets big_rows",
         ),
         _BLENDED,
-        "out float checkpoints  // transmittance of each tile in front of every SEGMENT splats",
+        "out float checkpoints  // by segment of a tile's list: transmittance of each pixel in front of it, "
+        "index of its first splat",
         "out float record_gradients  // records RecordGradient by gradient buffer offset",
         "out real background_sums  // (tiles, 3) with respect to the background",
         "out float tapes  // a Tape for each work-item",

@@ -53,8 +53,8 @@ class RecordedFrame:
         self.generation = frame.pool.generation
 
     def set_view(self, view: View, queue: cl.CommandQueue) -> bool:
-        """Bind the uniforms of a view. Returns False if the frame must be recorded (again), as there is no
-        recording, or a scratch buffer was replaced."""
+        """Bind the uniforms of a view. Returns False if there is no recording, or if a scratch buffer was
+        replaced: the frame must be recorded then."""
         if self.generation is None or self.generation is not self.workspace.pool.generation:
             return False
         pool = self.workspace.pool

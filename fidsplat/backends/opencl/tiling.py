@@ -31,7 +31,7 @@ LOCAL_TILES = 4096
 _WORK_GROUP_SPLATS = 4096
 """splats per work-group of the strategy `bin_local` (as in tile_lists_local.cl)"""
 _ITEMS = 256
-"""work-group size: BIN_ITEMS and SORT_ITEMS of the kernels"""
+"""work-group size: BIN_ITEMS, SORT_ITEMS and CULL_ITEMS of the kernels"""
 _START_TILES, _MAX_START_GROUPS = 512, 32
 """tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups: each reads all list
 lengths"""

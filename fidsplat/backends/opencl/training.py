@@ -125,7 +125,7 @@ class OpenCLTraining:
     """
 
     max_pending_losses = SLOTS // 2 - 1  # a frame that exceeds its capacity uses two slots
-    """number of later frames after which a loss may still be read"""
+    """maximum number of frames that are submitted before a loss is read"""
 
     def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
         """lanes: vector width; 0 for the device's own."""

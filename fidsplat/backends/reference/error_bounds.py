@@ -215,11 +215,13 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
 
 
 def of_order(span: Span, depth_bias: np.ndarray) -> tuple[Span, np.ndarray]:
-    """Bounds over all depth orders that rounding allows, for fragments or layers (k, m) sorted by depth.
+    """Bounds of transmittance and colour over all depth orders that rounding allows.
 
-    Returns the span with bounds of the transmittance in front of each fragment, and (k,) the largest change
-    of a pixel's colour, for colours in [0, 1]. depth_bias (k, m): length subtracted from each depth before
-    sorting. Swapping two neighbours changes a colour by at most the product of their opacities and the
+    span: of fragments or layers (k, m) sorted by depth. Returns it with wider intervals of the transmittance
+    in front of each fragment, and (k,) the largest change of a pixel's colour, for colours in [0, 1].
+    depth_bias (k, m): length subtracted from each depth before sorting.
+
+    Swapping two neighbours changes a colour by at most the product of their opacities and the
     transmittance in front of them, and every possible order results from swaps of pairs with overlapping
     depth intervals. Exactly equal depths keep their order.
     """

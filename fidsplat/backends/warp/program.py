@@ -26,7 +26,7 @@ EFFECTS = frozenset(
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "arithmetic_approximate"}
     | {"motion_groups", "shutter_exposure", "external_depth"}
-    | {"ellipsoids_only", "shutter_rows"}  # without influence on images
+    | {"ellipsoids_only", "sub_frame_culling"}  # without influence on images
 )
 """supported features, in addition to outputs and post-processing steps, which have a file each"""
 _SETTINGS = {"blend_half": "blend_precision='float16'", "blend_double": "blend_precision='float64'"}
