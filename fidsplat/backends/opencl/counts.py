@@ -18,6 +18,8 @@ VISIBLE, PAIRS, BIG = 0, 2, 6
 
 @dataclass(frozen=True)
 class Counts:
+    """Numbers of splats and pairs of a frame, of all its views."""
+
     big: int
     """number of splats whose tiles do not fit into a window (bit mask of 8 x 4 tiles)"""
     pairs: int
@@ -33,8 +35,7 @@ class Counts:
     @staticmethod
     def of_counters(words: np.ndarray) -> Counts:
         """Counts of a frame from the buffer `counters` (views, COUNTERS); `big` of the first view only."""
-        first, *others = words.tolist()
-        visible = first[VISIBLE] + sum(view[VISIBLE] for view in others)
+        first, visible = words[0].tolist(), sum(words[:, VISIBLE].tolist())
         return Counts(first[BIG], first[PAIRS] | first[PAIRS + 1] << 32, visible)
 
     def stats(self, splats: int) -> dict[str, int]:

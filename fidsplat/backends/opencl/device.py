@@ -87,6 +87,8 @@ def open_device(selector: str = "") -> OpenCLBackend:
 
 
 class OpenCLBackend(Workspace, Backend):
+    """An open OpenCL device, with its compiled pipelines."""
+
     def __init__(self, device: cl.Device) -> None:
         if is_pocl(device):
             linker.provide_linker()

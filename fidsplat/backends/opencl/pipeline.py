@@ -75,7 +75,11 @@ class OpenCLPipeline(Pipeline):
         return CommandList(self.program)
 
     def render_view(self, cloud: OpenCLCloud, view: View) -> OpenCLImages:
-        """Render one view. A frame whose command list is cached is replayed, on a GPU without waiting."""
+        """Choose the kernels for the cloud, then replay a recorded frame of this size and cloud, or else plan
+        one and submit its stages (frame.py). On a GPU a replay does not wait.
+
+        The first frame is planned, the second is also recorded, and later frames are replayed.
+        """
         fastest = self._for_cloud(cloud)
         if fastest is not self:
             return fastest.render_view(cloud, view)
@@ -94,6 +98,7 @@ class OpenCLPipeline(Pipeline):
             return OpenCLImages(self, view, [frame.rendered()], cloud.count)
 
     def render(self, cloud: OpenCLCloud, views: ViewBatch) -> OpenCLImages:
+        """Plan and render a batch, in sub-batches of as many views as fit the memory budget."""
         if views.is_single:
             return self.render_view(cloud, views.view_at(0))
         if self._is_too_small_to_vectorise(cloud):
@@ -164,6 +169,7 @@ class OpenCLPipeline(Pipeline):
             return frame
 
     def images_of(self, frame: DeviceFrame) -> OpenCLImages:
+        """The images of a frame that was not divided."""
         return OpenCLImages(self, frame.view, [frame.rendered()], frame.cloud.count)
 
     def render_again(self, cloud: OpenCLCloud, view: View) -> Rendered:
@@ -218,6 +224,7 @@ class OpenCLPipeline(Pipeline):
         replay_queue: cl.CommandQueue | None = None,
         pair_limit: int = 0,
     ) -> DeviceFrame:
+        """Submit all stages of one frame. commands, replay_queue, pair_limit: see `DeviceFrame`."""
         self._trim(cloud, view, plan)
         frame = DeviceFrame(
             *(self.workspace, commands or self._commands, self.config),
