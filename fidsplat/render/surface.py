@@ -184,7 +184,7 @@ def _median_of(depth: np.ndarray) -> float:
     if not len(depths):
         raise InputError(
             f"the scene near the pixel or ray must have an opacity of at least {MEDIAN_OPACITY}, got less "
-            "in all of the patch; give another one"
+            "in all of the patch, as of the sky; give another one"
         )
     return float(np.median(depths))
 

@@ -112,7 +112,9 @@ def fit_surface(points: np.ndarray, origin: np.ndarray, ray: np.ndarray, radius:
     slope = float(ray @ normal)
     if abs(slope) < GRAZING:
         raise InputError(
-            "the surface must face the camera, got one that is parallel to the ray; give another pixel"
+            f"the ray must meet the surface at an angle of at least {np.degrees(np.arcsin(GRAZING)):.1f} "
+            f"degrees, got {np.degrees(np.arcsin(abs(slope))):.1f}; give another pixel or a camera in front "
+            "of the surface"
         )
     normal = -np.sign(slope) * normal
     distance = float((center + middle - origin) @ normal) / -abs(slope)

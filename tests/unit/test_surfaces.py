@@ -12,6 +12,7 @@ import fidsplat as fs
 from fidsplat.cameras.lenses import BrownConrady, Fisheye, Orthographic
 from fidsplat.cli import main
 from fidsplat.render.surface import surface_from_depth
+from fidsplat.scenes.surface import fit_surface
 from fidsplat.vision import read_back
 
 AT = np.array([5.0, -3.0, 7.0])
@@ -159,6 +160,17 @@ def test_a_bush_is_no_surface(renderer):
     pixel = tuple(camera().project(AT[None])[0])
     with pytest.raises(fs.InputError, match=r"one plane in at least 50 % of the patch, got \d+ %"):
         bush.surface_at(pixel=pixel, radius=0.3, renderer=renderer)
+
+
+def test_a_grazing_ray_is_refused_with_its_angle():
+    points = np.random.default_rng(0).uniform((-1, -1, 0), (1, 1, 0), (200, 3))
+    for degrees, refused in ((0.6, True), (1.5, False)):
+        ray = np.array([math.cos(math.radians(degrees)), 0, -math.sin(math.radians(degrees))])
+        if refused:
+            with pytest.raises(fs.InputError, match=r"at an angle of at least 1\.1 degrees, got 0\.6; give"):
+                fit_surface(points, -10 * ray, ray, 1.0)
+        else:
+            np.testing.assert_allclose(fit_surface(points, -10 * ray, ray, 1.0).position, 0, atol=1e-9)
 
 
 def test_a_marker_on_a_wall_is_upright_and_readable(wall, renderer):
