@@ -134,9 +134,11 @@ class ImageMapping(Mapping[str, np.ndarray]):
         """The images of the only output, for NumPy, PIL and OpenCV.
 
         Raises:
-            InputError: several outputs.
+            InputError: several outputs, or `copy=False` with another dtype.
         """
         image = self[self._only_output()]
+        if copy is False and dtype and dtype != image.dtype:
+            raise InputError(f"dtype must be {image.dtype} with copy=False, got {dtype}; omit copy=False")
         return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
 
     def __dlpack__(self, **options: Any) -> Any:
@@ -158,7 +160,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
         name = self._only_output()
         if self._is_shared(name):
             return self.device_array(name)
-        return self[name].copy()  # NumPy does not export read-only arrays by DLPack
+        return self[name].copy()  # DLPack before 1.0 has no read-only arrays
 
     def _only_output(self) -> str:
         """Name of the only output. Raises InputError for several outputs."""

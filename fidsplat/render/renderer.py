@@ -374,8 +374,14 @@ class Renderer:
     def _render_batch(self, resident: ResidentCloud, views: CaptureBatch) -> FrameBatch:
         interrupts.check()
         if any(capture.sensor.needs_metering for capture in views.captures):
-            metered = (self._metered(resident, views.capture(number)) for number in range(len(views)))
-            views = CaptureBatch(tuple(metered), mask=views.mask)
+            captures = [views.capture(number) for number in range(len(views))]
+            for number in views.active:
+                captures[number] = self._metered(resident, captures[number])
+            # masked views are not rendered, so they get the sensor of a rendered one
+            metered = next((captures[number].sensor for number in views.active), Sensor())
+            for number in {*range(len(views))} - {*views.active}:
+                captures[number] = captures[number].with_(sensor=metered)
+            views = CaptureBatch(tuple(captures), mask=views.mask)
         features, batch = prepare_batch(resident.all_splats, views)
         with self._lock:
             rendered = (batch.view_at(number) for number in range(len(batch)))

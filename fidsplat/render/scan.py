@@ -53,7 +53,7 @@ class Scan:
     """(r, beams) float32: reflectivity times cosine of incidence, times the fraction of the beam's area that
     is on the surface; 0 where there is no return"""
     label: np.ndarray | None
-    """(r, beams) int32, -1 where there is no return; None if not requested"""
+    """(r, beams) int32, -1 where there is no return; None without `label=True`"""
     poses: np.ndarray
     """(k, 4, 4) world_from_lidar, one for each rolling-shutter band of the scan"""
 
@@ -190,14 +190,15 @@ def scan_batch(
 
     Args:
         poses: (v, 7) world from lidar: x y z and a quaternion w x y z.
-        scene, lidar, renderer, start, label: as in `scan`; nothing moves during a scan.
+        scene, lidar, renderer, start, label: as in `scan`. Nothing moves during a scan: moving groups of the
+            scene have their poses at the middle of the scan.
 
     Raises:
         InputError: as `scan`.
     """
     renderer, resident = _renderer_and_cloud(scene, renderer)
     matrices = pose_matrices("poses", poses)
-    request = ScanRequest.of(lidar, scene, label, Motion(), start)
+    request = replace(ScanRequest.of(lidar, scene, label, None, start), moving=False)
     batch = renderer.render_batch(resident, request.capture(np.eye(4)), poses=poses)
     images = dict(batch)
 
@@ -232,6 +233,8 @@ class ScanRequest:
     motion: Motion
     start: float
     label: bool
+    moving: bool
+    """whether the lidar or a group of splats moves during the scan"""
 
     @classmethod
     def of(
@@ -243,12 +246,7 @@ class ScanRequest:
             motion = Motion(None, base.motion.groups)
         instance("motion", motion, Motion)
         start = base.shutter.time if start is None else number("start", start, "a finite number of seconds")
-        return cls(lidar, base, motion, start, label or bool(lidar.reflectivity))
-
-    @property
-    def moving(self) -> bool:
-        """Whether the lidar or a group of splats moves during the scan."""
-        return not self.motion.is_still
+        return cls(lidar, base, motion, start, label, not motion.is_still)
 
     def capture(self, pose: Any) -> Capture:
         lidar = self.lidar
@@ -270,7 +268,13 @@ class ScanRequest:
         return replace(
             self.base,
             camera=camera,
-            outputs=("rgb", "alpha", "normal", "distance_first", *["label"] * self.label),
+            outputs=(
+                "rgb",
+                "alpha",
+                "normal",
+                "distance_first",
+                *["label"] * (self.label or bool(lidar.reflectivity)),
+            ),
             quality=quality,
             background=(0.0, 0.0, 0.0),
             motion=self.motion,
@@ -298,7 +302,7 @@ class ScanRequest:
         assert isinstance(lens, RayTable)
         intensity = _intensity(images, by_ray(lens.directions), lidar.reflectivity)
         rays = {"range": images["distance_first"], "intensity": intensity}
-        if "label" in images:
+        if self.label:
             rays["label"] = images["label"]
         returns = _returns({name: values.reshape(pixels.shape) for name, values in rays.items()}, lidar)
         _simulate_detection(returns, lidar, np.random.default_rng((lidar.seed, number_of_scan)))

@@ -117,6 +117,21 @@ def test_an_image_is_exposed_by_its_light():
     assert np.allclose(seen(veiling_glare=0.3), light, rtol=1e-5)  # of a uniform image
 
 
+@pytest.mark.parametrize("mask", [(False, True, False), (False, False, False)])
+def test_masked_views_are_not_metered(monkeypatch, mask):
+    color, renderer = (0.5, 0.7, 0.9), fs.Renderer("reference")
+    camera = fs.Camera.look_at(20, 10, 1.0, (0, 0, 0), (0, 0, 1))
+    capture = fs.Capture(camera, background=color, sensor=fs.Sensor(auto_exposure=0.18, veiling_glare=0.1))
+    cloud = renderer.upload(fs.SplatCloud.empty())
+    expected = renderer.render(cloud, capture)["rgb"]
+    rendered, pipeline = [], renderer.backend.pipeline
+    monkeypatch.setattr(renderer.backend, "pipeline", lambda *args: rendered.append(args) or pipeline(*args))
+    batch = renderer.render_batch(cloud, [capture] * 3, mask=np.array(mask))
+    assert len(rendered) == 1 + sum(mask)  # the batch, and a small frame for each view that is rendered
+    for image, active in zip(batch["rgb"], mask, strict=True):
+        np.testing.assert_array_equal(image, expected if active else 0 * expected)
+
+
 def test_glare_lightens_the_dark_half_of_an_image():
     """The image's mean times the share, at every size and in batches."""
     sky = fs.Panorama(np.repeat([[[0.8, 0.4, 0.2]], [[0.0, 0.0, 0.0]]], [64, 64], 0).repeat(256, 1))

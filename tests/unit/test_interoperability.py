@@ -55,6 +55,9 @@ def test_a_frame_of_one_output_is_an_array():
     np.testing.assert_array_equal(np.asarray(one), one["rgb"])
     assert np.asarray(one, np.float64).dtype == np.float64
     assert np.array(one).flags.writeable  # a copy
+    assert np.shares_memory(one.__array__(copy=False), one["rgb"])
+    with pytest.raises(ValueError, match="dtype must be float32 with copy=False, got float64"):
+        one.__array__(np.dtype(np.float64), copy=False)
     assert cv2.cvtColor(np.asarray(one), cv2.COLOR_RGB2GRAY).shape == (16, 24)
     with pytest.raises(
         fs.InputError, match=r"must have one output, got 2 \(rgb, depth\); access one by its name"

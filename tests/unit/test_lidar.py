@@ -179,6 +179,28 @@ def test_a_batch_equals_single_scans(renderer, room):
     assert (batch[0].range != batch[1].range).any()
 
 
+def test_moving_splats_of_a_batch_are_at_the_middle_of_the_scan(device):
+    motion = fs.Trajectory([0.0, 1.0], [np.eye(4), turned(0, 0, 0, (1.0, 0, 0))])
+    scene = fs.Scene([plane((1, 0, 0), 4.0, 6.0)], cloud_motions={0: motion})
+    (batch,) = fs.scan_batch(scene, IDEAL, [[0, 0, 0, 1, 0, 0, 0]], renderer=device, start=0.45)
+    single = fs.scan(scene, IDEAL, np.eye(4), renderer=device, start=0.45)  # from 0.45 s to 0.55 s
+    assert np.nanmedian(single.points[..., 0]) == pytest.approx(4.5, abs=0.05)
+    assert np.nanmedian(batch.points[..., 0]) == pytest.approx(4.5, rel=1e-5)
+    assert len(batch.poses) == 1
+
+
+def test_reflectivities_do_not_add_labels(device):
+    scene, lidar = plane((1, 0, 0), 4.0, 6.0, label=7), replace(IDEAL, reflectivity={7: 0.25})
+    with_label, without = (
+        fs.scan(scene, lidar, np.eye(4), renderer=device, label=label) for label in (True, False)
+    )
+    assert without.label is None
+    assert "label" not in without.cloud().dtype.names
+    assert set(np.unique(with_label.label)) == {-1, 7}
+    np.testing.assert_array_equal(without.intensity, with_label.intensity)
+    assert without.intensity.max() == pytest.approx(0.25, rel=0.01)
+
+
 def test_against_ray_casting_of_the_mesh(device):
     """Splats on the faces of a box with thickness, against trimesh's intersections."""
     trimesh = pytest.importorskip("trimesh", reason="trimesh casts the rays")
