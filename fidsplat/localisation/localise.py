@@ -28,7 +28,7 @@ from fidsplat.util.errors import InputError
 
 MAX_VALUE = 100.0
 """maximum display value of an image: floats from 0 to 255 are an error"""
-MAX_DEVIATION = 0.1
+MAX_DEVIATION = 0.01
 """radians: maximum standard deviation of the rotation of a found pose"""
 MIN_CONFIRMED_INLIERS, CONFIRMED = 0.4, 2e-3
 """minimum fraction of matching blocks of a found pose whose marker error or standard deviation of the
@@ -64,8 +64,8 @@ class Localisation:
 
     @property
     def found(self) -> bool:
-        """Whether `angle_deviation` is at most 0.1 radians and at least 0.6 of the image's textured blocks
-        match the scene, or 0.4 if `angle_deviation` or `marker_error` is at most 2 milliradians."""
+        """Whether `angle_deviation` is at most 10 milliradians, and at least 0.6 of the image's textured
+        blocks match the scene, or 0.4 if `angle_deviation` or `marker_error` is at most 2 milliradians."""
         angle = self.angle_deviation
         confirmed = angle <= CONFIRMED or (self.marker_error is not None and self.marker_error <= CONFIRMED)
         return (

@@ -479,14 +479,14 @@ def test_errors_of_localisation(renderer, room, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("deviation", "inliers", "marker_error", "found"),
     [
-        (1e-2, 0.6, None, True),
-        (1e-2, 0.59, None, False),
-        (1e-2, 0.59, 3e-3, False),
-        (1e-2, 0.4, 1e-3, True),
-        (1e-2, 0.39, 1e-3, False),
+        (9e-3, 0.6, None, True),
+        (9e-3, 0.59, None, False),
+        (9e-3, 0.59, 3e-3, False),
+        (9e-3, 0.4, 1e-3, True),
+        (9e-3, 0.39, 1e-3, False),
         (1e-3, 0.4, None, True),
         (1e-3, 0.39, None, False),
-        (0.2, 1.0, 1e-3, False),
+        (0.011, 1.0, 1e-3, False),
     ],
 )
 def test_matching_blocks_deviation_and_markers_decide_whether_a_pose_is_found(
