@@ -422,9 +422,9 @@ class Assembler:
             bounds = bounds.with_members(effect.bounds)
             record_gradient = record_gradient.with_members(effect.record_gradient)
         # as many padding fields as in `RecordGradient`
-        alignment = record_gradient.alignment // 4 * scalar_types.dtype("real").itemsize
+        record_alignment = record_gradient.alignment // 4 * scalar_types.dtype("real").itemsize
         fields = tuple(chain.from_iterable(member.names for member in record_gradient.members))
-        totals = Record("Totals", (Member("real", fields, "of all tiles"),), alignment)
+        totals = Record("Totals", (Member("real", fields, "of all tiles"),), record_alignment)
         splat = splat.without({**self._constants, **self._packed})
         self._structs = {record.name: record for record in (view, splat, bounds, record_gradient, totals)}
         self._used_structs: dict[str, np.dtype] = {}

@@ -37,7 +37,7 @@ class FrameBuffers:
     splats: cl.Buffer
     """records `Splat` (v, n)"""
     keys: cl.Buffer
-    """sort keys by depth (v, n) uint32"""
+    """sort keys by depth (v, n) uint32; two values above all depths mark culled splats (prelude.cl)"""
     windows: cl.Buffer
     """tiles that a splat overlaps (v, n) uint2: a bit mask of 8 x 4 tiles at most, or its index in `big`"""
     counters: cl.Buffer

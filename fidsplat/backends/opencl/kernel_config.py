@@ -28,6 +28,7 @@ class KernelConfig:
     scan_items: int
     """work-group size of prefix sums and of `bin_local`"""
     fast_fma: bool
+    """whether a fused multiply-add is one instruction of the device"""
     k_buffer_size: int
     """fragments of a pixel that the k-buffer sorts by depth at once; at most 254, or 31 in `group`"""
     rows: int = 2

@@ -3,7 +3,8 @@
 The projection computes in the type `real`, blending in `blend_real`: float or double (declare.ScalarTypes).
 
 assemble.py prints them as C into kernels/opencl/, and the host binds arguments by name. Buffers are
-(channels, rows, columns) of the padded sample grid, unless a note has another shape.
+(channels, rows, columns) of the padded sample grid, unless a note has another shape. Capitals in notes are
+build constants and enums of the kernels.
 """
 
 from __future__ import annotations

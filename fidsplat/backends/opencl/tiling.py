@@ -35,6 +35,8 @@ _ITEMS = 256
 _START_TILES, _MAX_START_GROUPS = 512, 32
 """tiles per work-group of the kernel `tile_starts`, and maximum number of work-groups: each reads all list
 lengths"""
+_MIN_UNCULLED = 1 << 12
+"""initial capacity for splats in groups that are not culled"""
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 """window of a splat without tiles: an index beyond the end of `big`, and no bits"""
 
@@ -62,9 +64,9 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
 
 def cull(frame: DeviceFrame, big: int) -> None:
     """List the groups of splats that are not culled by their bounding spheres, and set
-    `frame.records_per_view`."""
+    `frame.records_per_view`. big: see `allocate_counters`, which is called again with a longer list."""
     pool, culling_groups = frame.pool, -(-frame.cloud.count // CULLING_GROUP)
-    frame.scratch("unculled", 4 * MIN_BIG // CULLING_GROUP)
+    frame.scratch("unculled", 4 * _MIN_UNCULLED // CULLING_GROUP)
     for name in ("spheres", "max_scales", "splat_ids"):
         frame.named[name] = frame.cloud.sorted_array(name)
     while True:
