@@ -236,8 +236,9 @@ class AlignmentKernels(ABC):
         return Score(sums, derivatives)
 
     def axes(self, stage: int) -> tuple[int, ...]:
-        """Axes of the motions of `score`. A motion along the ray of a pixel and a rotation about it do not
-        change the pixel, so that the derivatives by z follow from those by x and y behind a pinhole."""
+        """Axes of the motions of `score`. A translation along the ray of a pixel or a rotation about it does
+        not change the pixel. Without a lens, the derivatives with respect to z therefore follow from the
+        derivatives with respect to x and y."""
         return (0, 1, 3, 4) if self._stages[stage].camera.lens is None else tuple(range(6))
 
     def motion_size(self, stage: int, axis: int, sums: AlignmentSums) -> float:

@@ -1,4 +1,4 @@
-"""`fidsplat bench`."""
+"""Command `fidsplat bench`: time frames of standard scenes."""
 
 import sys
 from dataclasses import dataclass

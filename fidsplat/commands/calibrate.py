@@ -1,4 +1,4 @@
-"""`fidsplat experiment calibrate` and `fidsplat experiment tags`."""
+"""Commands `fidsplat experiment calibrate` and `tags`: calibrate cameras, test tag detectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fidsplat capture`."""
+"""Command `fidsplat capture`: make a metric scene from photographs or a video."""
 
 from __future__ import annotations
 

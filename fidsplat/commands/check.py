@@ -1,4 +1,4 @@
-"""`fidsplat check`."""
+"""Command `fidsplat check`: test a device with hard cases of splat rendering."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`fidsplat convert`."""
+"""Command `fidsplat convert`: convert splat files and meshes."""
 
 from __future__ import annotations
 

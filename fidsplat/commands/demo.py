@@ -1,4 +1,4 @@
-"""`fidsplat demo`."""
+"""Command `fidsplat demo`: markers in a scene, rendered and detected."""
 
 import math
 from dataclasses import dataclass, field

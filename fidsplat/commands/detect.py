@@ -1,4 +1,4 @@
-"""`fidsplat detect`."""
+"""Command `fidsplat detect`: detect codes in images, videos and robot logs."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""`fidsplat devices` and `fidsplat warm`."""
+"""Commands `fidsplat devices` and `fidsplat warm`: list devices, and compile their kernels in advance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fidsplat experiment`."""
+"""Command `fidsplat experiment`: run experiments."""
 
 from __future__ import annotations
 

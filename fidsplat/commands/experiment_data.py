@@ -1,4 +1,4 @@
-"""`fidsplat experiment`: Blender's images, plants, results of shards, reports."""
+"""Commands `fidsplat experiment` for data: Blender's images, plants, results of shards, reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fidsplat experiment localise`."""
+"""Command `fidsplat experiment localise`: localise a robot by tags and a LiDAR."""
 
 from __future__ import annotations
 

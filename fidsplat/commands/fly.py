@@ -1,4 +1,4 @@
-"""`fidsplat fly`."""
+"""Command `fidsplat fly`: render a scene along a trajectory."""
 
 from __future__ import annotations
 

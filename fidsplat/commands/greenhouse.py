@@ -1,4 +1,4 @@
-"""`fidsplat greenhouse`."""
+"""Command `fidsplat greenhouse`: make a greenhouse of splats."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,4 @@
-"""`fidsplat info`."""
+"""Command `fidsplat info`: describe a splat file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fidsplat localise`."""
+"""Command `fidsplat localise`: find the poses of photographs in a scene."""
 
 from __future__ import annotations
 

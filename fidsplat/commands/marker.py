@@ -1,4 +1,4 @@
-"""`fidsplat marker`."""
+"""Command `fidsplat marker`: make a marker and place it in a scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fidsplat plan-tags`."""
+"""Command `fidsplat plan-tags`: plan the positions of tags."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fidsplat render` and `fidsplat gallery`."""
+"""Commands `fidsplat render` and `fidsplat gallery`: render scenes to images."""
 
 from __future__ import annotations
 

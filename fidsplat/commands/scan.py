@@ -1,4 +1,4 @@
-"""`fidsplat scan`."""
+"""Command `fidsplat scan`: scan a scene with a simulated LiDAR."""
 
 from __future__ import annotations
 

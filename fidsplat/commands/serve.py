@@ -1,4 +1,4 @@
-"""`fidsplat serve`."""
+"""Command `fidsplat serve`: send images, poses and LiDAR points of a scene as ROS 2 messages."""
 
 from __future__ import annotations
 

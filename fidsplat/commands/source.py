@@ -1,4 +1,4 @@
-"""`fidsplat source`."""
+"""Command `fidsplat source`: print the OpenCL program of a scene."""
 
 import sys
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""`fidsplat store`."""
+"""Command `fidsplat store`: build, place and check stores of splats on disk."""
 
 from __future__ import annotations
 

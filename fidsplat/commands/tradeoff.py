@@ -1,4 +1,4 @@
-"""`fidsplat tradeoff`."""
+"""Command `fidsplat tradeoff`: measure time and error of quality settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fidsplat train`."""
+"""Command `fidsplat train`: train splats on images with known cameras."""
 
 from __future__ import annotations
 

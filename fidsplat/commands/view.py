@@ -1,4 +1,4 @@
-"""`fidsplat view`."""
+"""Command `fidsplat view`: show a scene in a browser."""
 
 from __future__ import annotations
 

@@ -85,7 +85,9 @@ _WITHOUT_OUTPUT = (
 )
 _IMAGES = (
     _image("alpha", "coverage, 1 - transmittance", **_COLOR),
-    _image("depth", "expected depth along z [m]; 0 where alpha is below 1/255", **_DEPTH),
+    _image(
+        "depth", "expected depth [m] along z (fisheye, panorama: ray); 0 where alpha is below 1/255", **_DEPTH
+    ),
     _image("depth_median", "depth [m] at which transmittance falls to 1/2", **_FRAGMENT_DEPTH),
     _image("depth_first", "depth [m] at which opacity reaches the quality's first_hit", **_FRAGMENT_DEPTH),
     _image("distance", "expected distance along the ray [m]", needs="depth", **_DEPTH),

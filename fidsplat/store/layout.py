@@ -137,8 +137,8 @@ def read_header(folder: Path) -> Header:
     version = content.get("version")
     if version != VERSION:
         raise InputError(
-            f"{folder} is a store of version {version!r}, and this fidsplat reads version {VERSION}; "
-            "use the fidsplat that wrote it, or build it again"
+            f"the version of the store {folder} must be {VERSION}, got {version!r}; use the fidsplat that "
+            "wrote it, or build it again"
         )
     try:
         if content.get("crc") != header_crc(content):

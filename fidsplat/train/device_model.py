@@ -29,7 +29,7 @@ class DeviceModel:
     """Splats in training in device memory, with the images of the data set."""
 
     def __init__(self, kernels: Any, views: Sequence[TrainingView], settings: TrainSettings) -> None:
-        """kernels: the result of `Backend.training`."""
+        """kernels: training kernels of a backend (`Backend.training`)."""
         self._kernels, self._settings = kernels, settings
         self.max_pending_losses = kernels.max_pending_losses
         cameras = [view.camera for view in views]

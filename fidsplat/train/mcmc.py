@@ -33,8 +33,8 @@ def relocate_and_grow(splats: Splats, settings: TrainSettings, iteration: int) -
     alive = np.flatnonzero(opacities > settings.dead_opacity)
     if not len(alive):
         raise TrainingError(
-            f"all splats are dead after iteration {iteration}: their opacities are at most "
-            f"{settings.dead_opacity:g}; check the data set's cameras and points"
+            f"opacities after iteration {iteration} must be above {settings.dead_opacity:g} for at least one "
+            f"splat, got at most {opacities.max(initial=0):.2g}; check the data set's cameras and points"
         )
     if len(dead):
         sources = alive[_sample(opacities[alive], len(dead), settings, RandomStream.RELOCATION, iteration)]

@@ -29,7 +29,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     splat |= {"edges": wp.vec4} if edged else {}
     splat |= {"boxed": wp.float32} if flagged else {}
     splat |= {"ellipsoid_term": wp.float32} if thick else {}
-    # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
+    # origin: ray of the anchor; w: factors of the ray's Z relative to it in n_u, n_v and D, then origin.x
     splat |= {"w": wp.vec4, "origin": wp.vec3} if has_lens else {}
     # plane_z0, plane_zx, plane_zy, plane_near
     splat |= {"plane": wp.vec4} if parallel else {}

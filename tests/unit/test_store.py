@@ -132,7 +132,7 @@ def test_an_incomplete_store_is_refused(store, tmp_path):
         (folder / name).write_bytes(original[name])
     header = json.loads(original["store.json"])
     for change, match in [
-        ({"version": 2}, "a store of version 2, and this fidsplat reads version 1"),
+        ({"version": 2}, "the version of the store .* must be 1, got 2"),
         ({"format": "zip"}, "another format"),
         ({"rows": -1}, "out of range"),
         ({"columns": []}, "not a table"),
@@ -185,8 +185,8 @@ def crafted(folder, nodes=None, **changes):
         ("size", -1, np.nan, "finite"),
         ("reach", 2, -1.0, "at least 0"),
         ("low", 2, np.inf, "finite"),
-        ("low", 2, 1e9, "within the larger one"),
-        ("far_high", 2, -1e9, "within the larger one"),
+        ("low", 2, 1e9, "within the larger box"),
+        ("far_high", 2, -1e9, "within the larger box"),
     ],
 )
 def test_an_index_that_contradicts_its_header_is_refused(store, tmp_path, name, number, value, match):

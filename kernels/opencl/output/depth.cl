@@ -1,4 +1,4 @@
-// depth (h, w): expected depth along z [m], sum w z / sum w; 0 where alpha is below 1/255.
+// depth (h, w): expected depth [m] along z (fisheye, panorama: along the ray), sum w z / sum w; 0 where alpha is below 1/255.
 //@ state
     vfloat depth, depth_weight;
 //@ start
