@@ -13,7 +13,7 @@ independent, the pixels within a block may be correlated.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -155,10 +155,10 @@ def align(
                 fit = at.fit
                 found = Alignment(start.with_pose(at.pose), np.full((6, 6), np.nan), 0.0, at.noise, fit.gain)
             else:
-                found = _finish(at, score, all_stages[-1])
+                found = _finish(at, score, all_stages[-1], start)
         finally:
             kernels.release_scene()
-    return replace(found, camera=start.with_pose(found.camera.world_to_camera))
+    return found
 
 
 def _moved(at: Estimate, sums: AlignmentSums, step: np.ndarray) -> Estimate:
@@ -225,18 +225,18 @@ def _minimise_stage(at: Estimate, stage: _Stage, steps: int, settled: float) -> 
     return at
 
 
-def _finish(at: Estimate, score: Score, stage: _Stage) -> Alignment:
+def _finish(at: Estimate, score: Score, stage: _Stage, camera: Camera) -> Alignment:
     """Run the last steps; if they do not converge, run them again after steps with Huber's loss. Tukey's loss
     is not convex, and ignores edges displaced by more than a fraction of a pixel."""
-    alignment, settled = _last_steps(at, score, stage)
+    alignment, settled = _last_steps(at, score, stage, camera)
     if settled:
         return alignment
     at, again = _minimise(at, [(stage, _FULL_STEPS)], stage, _FULL_SETTLED)
     assert again is not None
-    return _last_steps(at, again, stage)[0]
+    return _last_steps(at, again, stage, camera)[0]
 
 
-def _last_steps(at: Estimate, score: Score, stage: _Stage) -> tuple[Alignment, bool]:
+def _last_steps(at: Estimate, score: Score, stage: _Stage, camera: Camera) -> tuple[Alignment, bool]:
     """Minimise Tukey's loss by Newton's method with a line search. Returns the alignment, with an infinite
     covariance if the pixels do not determine it, and whether all steps decreased the loss and converged. The
     derivative of the score is that of the first step."""
@@ -263,8 +263,7 @@ def _last_steps(at: Estimate, score: Score, stage: _Stage) -> tuple[Alignment, b
     sums, image_noise = best[1], max(stage.kernels.noise, MIN_IMAGE_NOISE)
     covariance = np.diag(np.full(6, np.inf)) if inverse is None else _covariance(sums, inverse)
     inliers, excess = _agreement(sums, image_noise / float(np.median(at.fit.gain)))
-    camera = stage.camera.with_pose(at.pose)
-    alignment = Alignment(camera, excess * covariance, inliers, sums.noise, at.fit.gain)
+    alignment = Alignment(camera.with_pose(at.pose), excess * covariance, inliers, sums.noise, at.fit.gain)
     return alignment, bool(settled) and not rejected
 
 

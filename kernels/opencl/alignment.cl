@@ -168,18 +168,18 @@ static inline float residuals_of(
     return sqrt(square / channels);
 }
 
-#define SPAN (ITEMS > 1 ? 2 * ITEMS : 1024)
+#define SPAN (ITEMS > 1 ? ITEMS : 1024)
 #define CONVERGED 7   // index in `fit`: whether the level has converged, so that its sums are not needed
 #define EXPOSURE const float gain[3] = {fit[0], fit[1], fit[2]}, offset[3] = {fit[3], fit[4], fit[5]}
 
 #if ITEMS > 1
-// A channel of a pixel of an image of three channels after `align_blur` along both axes.
-static inline float blurred(global const float *image, int x, int y, int c, int width, int height, global const float *taps, int radius) {
-    float sum = 0.0f;
+// A pixel of an image of three channels after `align_blur` along both axes.
+static inline float3 blurred(global const float *image, int x, int y, int width, int height, global const float *taps, int radius) {
+    float3 sum = 0.0f;
     for (int j = -radius; j <= radius; j++) {
-        global const float *row = image + clamp(y + j, 0, height - 1) * (size_t)width * 3 + c;
-        float part = 0.0f;
-        for (int i = -radius; i <= radius; i++) part += taps[abs(i)] * row[3 * clamp(x + i, 0, width - 1)];
+        global const float *row = image + clamp(y + j, 0, height - 1) * (size_t)width * 3;
+        float3 part = 0.0f;
+        for (int i = -radius; i <= radius; i++) part += taps[abs(i)] * vload3(clamp(x + i, 0, width - 1), row);
         sum += taps[abs(j)] * part;
     }
     return sum;
@@ -201,8 +201,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_errors(
         for (int i = first + get_local_id(0); i < min(first + SPAN, pixels); i += ITEMS) {
             float residual[3];
 #if ITEMS > 1
-            if (radius)
-                for (int c = 0; c < 3; c++) rgb[3 * (size_t)i + c] = blurred(rendered, i % width, i / width, c, width, height, taps, radius);
+            if (radius) vstore3(blurred(rendered, i % width, i / width, width, height, taps, radius), i, rgb);
 #endif
             if (bins[i] < min_bin) continue;
             COUNT(group_counts, bin_of(residuals_of(i, channels, image, rgb, gain, offset, residual)));

@@ -37,7 +37,7 @@ from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.cameras.raster import raster_of
 
-_GROUPS = {1: 32, 32: 256}
+_GROUPS = {1: 32, 64: 1024}
 """maximum number of work-groups of a sum, by the size of a work-group"""
 _GROUP_FLOATS = 249
 """floats that a work-group writes: SUMS of alignment.cl, and the noise"""
@@ -62,7 +62,7 @@ class OpenCLAlignment(AlignmentKernels):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
         self._workspace = workspace
-        self._items = 1 if workspace.config.schedule == "lanes" else 32
+        self._items = 1 if workspace.config.schedule == "lanes" else 64
         self._program = Program(workspace, assemble_alignment(self._items))
         self._commands, self._pyramid_commands = CommandList(self._program), CommandList(self._program)
         self._step_programs: dict[bool, Program] = {}
@@ -228,15 +228,22 @@ class OpenCLAlignment(AlignmentKernels):
     def minimise(
         self, at: Estimate, steps: Sequence[tuple[int, int]], last: int | None, tolerance: float
     ) -> tuple[Estimate, Score | None] | None:
-        with self._workspace.rendering():
-            recorded = self._recorded(at, steps, last, tolerance)
-            if recorded is None:
-                return None
-            state, pose, score = self._minimise(at, steps, *recorded)
-        if state[_INCOMPLETE]:
+        if self._items == 1:
             return None
-        gain, offset = state[:6].reshape(2, 3)[:, : len(at.fit.gain)].astype(float)
-        return Estimate(pose, at.fit._replace(gain=gain, offset=offset), float(state[_NOISE])), score
+        pose = at.pose
+        for attempt in range(_ATTEMPTS):
+            with self._workspace.rendering():
+                recorded = self._recorded(at, steps, last, tolerance)
+                if recorded is not None:
+                    state, pose, score = self._minimise(at, steps, *recorded)
+                    if not state[_INCOMPLETE]:
+                        gain, offset = state[:6].reshape(2, 3)[:, : len(at.fit.gain)].astype(float)
+                        fit = at.fit._replace(gain=gain, offset=offset)
+                        return Estimate(pose, fit, float(state[_NOISE])), score
+            if not all(self.pixels) or (recorded is None and attempt):
+                return None
+            self.frame(len(self._stages) - 1, pose)  # allocates or enlarges the buffers of the lists
+        return None
 
     def _recorded(
         self, at: Estimate, steps: Sequence[tuple[int, int]], last: int | None, tolerance: float
@@ -306,12 +313,16 @@ class OpenCLAlignment(AlignmentKernels):
 
     def _read_score(self, commands: _StageCommands, channels: int) -> Score:
         packed = self._read(commands.result, (commands.groups, _GROUP_FLOATS))
-        rows = self._read(commands.totals, (len(commands.sums), _GROUP_FLOATS - 1))
-        sums, derivatives, stage = _unpacked(packed, channels, True, False), {}, len(self._stages) - 1
-        for axis, row in zip(self.axes(stage), rows[1:], strict=True):
-            rhs = _unpacked(np.append(row, 0)[None], channels, False, True).rhs
-            derivatives[axis] = rhs / self.motion_size(stage, axis, sums)
-        return Score(sums, derivatives)
+        totals = self._read(commands.totals, (len(commands.sums), _GROUP_FLOATS - 1))
+        sums, stage = _unpacked(packed, channels, True, False), len(self._stages) - 1
+        rhs = totals[1:, :240].reshape(-1, 3, 10, 8)[:, :channels, 8:].swapaxes(2, 3).astype(float)
+        return Score(
+            sums,
+            {
+                axis: one / self.motion_size(stage, axis, sums)
+                for axis, one in zip(self.axes(stage), rhs, strict=True)
+            },
+        )
 
     def _step_commands(
         self, stage: int, replayed: _Replayed, channels: int, tolerance: float
@@ -470,7 +481,7 @@ class OpenCLAlignment(AlignmentKernels):
         return image
 
     def _errors_size(self, args: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        spans = -(-args["width"] * args["height"] // (2 * self._items))
+        spans = -(-args["width"] * args["height"] // self._items)
         return self._size(min(spans, 4096 if self._items > 1 else _GROUPS[1]))
 
     def _sums_size(self, groups: int, channels: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
