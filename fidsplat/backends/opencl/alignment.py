@@ -254,7 +254,7 @@ class OpenCLAlignment(AlignmentKernels):
         for _ in range(_ATTEMPTS):  # recording may replace buffers of earlier recordings
             generation, replayed = pool.generation, self._replay(at.pose)
             if replayed is None:
-                return None
+                continue
             commands = [self._step_commands(stage, replayed, channels, tolerance) for stage, _ in steps]
             score = None if last is None else self._score_commands(last, replayed, channels)
             if replayed.bind() and pool.generation is generation:
