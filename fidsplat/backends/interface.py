@@ -106,7 +106,7 @@ class Images(ABC):
     """Output images of one or several views, on the device until they are read. Views that are masked out
     have the value `Output.empty_value`."""
 
-    views: int = 1
+    view_count: int = 1
     """number of views, including masked-out views"""
     timings: Mapping[str, float]
     """milliseconds on the device by stage, in the order of the stages; summed over views"""
@@ -158,7 +158,7 @@ class HostImages(Images):
     ) -> None:
         """arrays: (views, ...) by the names of outputs."""
         self.arrays, self.timings, self.stats = arrays, timings, stats
-        self.views = len(next(iter(arrays.values())))
+        self.view_count = len(next(iter(arrays.values())))
 
     def arrays_of(self, index: int) -> dict[str, np.ndarray]:
         """The arrays of one view."""
@@ -177,7 +177,7 @@ class SeparateImages(Images):
 
     def __init__(self, images: Mapping[int, Images], batch: ViewBatch, splats: int) -> None:
         """images: by position of the view in the batch. splats: number of splats of the cloud."""
-        self._images, self.views, self._size, self._splats = images, batch.total, batch.size, splats
+        self._images, self.view_count, self._size, self._splats = images, batch.total, batch.size, splats
 
     def read(self, name: str, index: int | None = None) -> np.ndarray:
         output = declared_output(name)
@@ -186,7 +186,7 @@ class SeparateImages(Images):
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         if index is not None:
             return np.full(shape, output.empty_value, output.dtype)
-        stack = np.full((self.views, *shape), output.empty_value, output.dtype)
+        stack = np.full((self.view_count, *shape), output.empty_value, output.dtype)
         for number, images in self._images.items():
             stack[number] = images.read(name, 0)
         return stack
@@ -204,11 +204,11 @@ class SeparateImages(Images):
         return batch_stats((images.stats for images in self._images.values()), self._splats)
 
 
-def check_batch_memory(views: int, size: int, budget: int) -> None:
+def check_batch_memory(view_count: int, size: int, budget: int) -> None:
     """Raise DeviceError if the images of a batch exceed the memory budget."""
     if size > budget:
         raise DeviceError(
-            f"the images of {views} views must be at most {bytes_words(budget)}, the memory budget, got "
+            f"the images of {view_count} views must be at most {bytes_words(budget)}, the memory budget, got "
             f"{bytes_words(size)}; render fewer views or outputs at once"
         )
 
@@ -234,13 +234,13 @@ class Pipeline(ABC):
     def render_view(self, cloud: Any, view: View) -> Images:
         """Render one view of an uploaded cloud."""
 
-    def render(self, cloud: Any, views: ViewBatch) -> Images:
+    def render(self, cloud: Any, batch: ViewBatch) -> Images:
         """Render several views, each bit-identical to rendering it alone. By default one after another."""
         images = {
-            index: self.render_view(cloud, views.view_at(number))
-            for number, index in enumerate(views.batch_indices.tolist())
+            index: self.render_view(cloud, batch.view_at(number))
+            for number, index in enumerate(batch.batch_indices.tolist())
         }
-        return SeparateImages(images, views, cloud.count)
+        return SeparateImages(images, batch, cloud.count)
 
     def render_subsampled(
         self, cloud: Any, view: View, step: int, progress: Callable[[float], object] | None = None

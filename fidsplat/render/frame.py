@@ -117,13 +117,13 @@ class Frame(ImageMapping):
 
     @property
     def timings(self) -> Mapping[str, float]:
-        if self._images.views > 1:
+        if self._images.view_count > 1:
             return {}
         return super().timings if self._error is None else {**super().timings, **self._error.timings}
 
     @property
     def stats(self) -> Mapping[str, int]:
-        return super().stats if self._images.views == 1 else {}
+        return super().stats if self._images.view_count == 1 else {}
 
 
 def _host_frame(
@@ -146,7 +146,7 @@ class FrameBatch(ImageMapping):
 
     def __init__(self, images: Images, views: CaptureBatch, scene_indices: SceneIndices = None) -> None:
         super().__init__(images, views.captures[0].outputs, scene_indices)
-        self._captures, self.views = views, images.views
+        self._captures, self.views = views, images.view_count
         """Number of views, including masked ones."""
 
     def __repr__(self) -> str:

@@ -15,16 +15,16 @@ _UNKNOWN = object()
 
 
 class Command:
-    """One kernel launch: its own kernel object with bound arguments, and its size."""
+    """One kernel launch: its own kernel object with bound arguments, and its sizes."""
 
-    __slots__ = ("_bound", "_types", "kernel", "local_size", "name", "size", "stage")
+    __slots__ = ("_bound", "_types", "global_size", "kernel", "local_size", "name", "stage")
 
     def __init__(self, kernel: cl.Kernel, name: str, types: Sequence[Callable[[Any], Any] | None]) -> None:
         """types: the NumPy type of each argument; None for a buffer."""
         self.kernel, self.name, self._types = kernel, name, types
         self._bound: list[object] = [_UNKNOWN] * len(types)
         self.stage = ""
-        self.size: tuple[int, ...] = ()
+        self.global_size: tuple[int, ...] = ()
         self.local_size: tuple[int, ...] = ()
 
     def bind(self, index: int, value: Any) -> None:
@@ -75,7 +75,7 @@ class CommandList:
     def record(
         self,
         kernel: str,
-        size: tuple[int, ...],
+        global_size: tuple[int, ...],
         local_size: tuple[int, ...],
         values: Sequence[Any],
         stage: str = "",
@@ -87,7 +87,7 @@ class CommandList:
             kernel_object = cl.Kernel(self.program.programs[kernel], kernel)
             commands.append(Command(kernel_object, kernel, self.program.types[kernel]))
         command = commands[number]
-        command.stage, command.size, command.local_size = stage, size, local_size
+        command.stage, command.global_size, command.local_size = stage, global_size, local_size
         for index, value in enumerate(values):
             command.bind(index, value)
         self._launch_counts[kernel] = number + 1
@@ -99,13 +99,13 @@ class CommandList:
         self,
         queue: cl.CommandQueue,
         kernel: str,
-        size: tuple[int, ...],
+        global_size: tuple[int, ...],
         local_size: tuple[int, ...],
         values: Sequence[Any],
         stage: str = "",
     ) -> cl.Event:
-        command = self.record(kernel, size, local_size, values, stage)
-        return cl.enqueue_nd_range_kernel(queue, command.kernel, size, local_size)
+        command = self.record(kernel, global_size, local_size, values, stage)
+        return cl.enqueue_nd_range_kernel(queue, command.kernel, global_size, local_size)
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Change arguments by name, in all commands that have one of that name."""
@@ -119,7 +119,7 @@ class CommandList:
     def submit(self, queue: cl.CommandQueue, first: int = 0, end: int | None = None) -> list[cl.Event]:
         """Enqueue the commands [first, end) in order; by default all."""
         return [
-            cl.enqueue_nd_range_kernel(queue, command.kernel, command.size, command.local_size)
+            cl.enqueue_nd_range_kernel(queue, command.kernel, command.global_size, command.local_size)
             for command in self._commands[first:end]
         ]
 

@@ -142,14 +142,16 @@ def render_in_slices(frame: DeviceFrame) -> None:
 
 def blend(frame: DeviceFrame, tile_range: TileRange) -> None:
     """Submit the blend kernel for a range of tiles; GPUs start with the longest lists."""
-    group = frame.config.blend_items
+    local_size = frame.config.blend_items
     arguments: dict[str, Any] = {"first_tile": tile_range.first}
     if frame.config.schedule == "group":
         ordered = frame.config.binning != "sort_first" and tile_range.end - tile_range.first == frame.tiles
         # every pointer argument needs a buffer; the kernel reads `tile_order` only if `longest_first`
         arguments["tile_order"] = frame.named["tile_order"] if ordered else frame.buffers.starts
         arguments["longest_first"] = ordered
-    frame.launch("blend", "blend", ((tile_range.end - tile_range.first) * group,), (group,), **arguments)
+    frame.launch(
+        "blend", "blend", ((tile_range.end - tile_range.first) * local_size,), (local_size,), **arguments
+    )
 
 
 def resolve(frame: DeviceFrame) -> None:

@@ -31,26 +31,26 @@ _KERNELS: WeakKeyDictionary[Workspace, tuple[cl.Kernel, int]] = WeakKeyDictionar
 
 
 def acquire_images(
-    workspace: Workspace, outputs: tuple[Output, ...], views: ViewBatch
+    workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch
 ) -> list[tuple[str, cl.Buffer]]:
     """Buffers for the output images of a batch, (views, h, w, channels) each; `Output.empty_value` in masked
     views. Raises DeviceError if they exceed the memory budget, or one of them exceeds the device's largest
     buffer."""
-    pixels = views.total * views.size[0] * views.size[1]
+    pixels = batch.total * batch.size[0] * batch.size[1]
     bytes_of = {output.name: 4 * pixels * output.channels for output in outputs}
     largest = max(bytes_of, key=bytes_of.__getitem__)
     if bytes_of[largest] > workspace.largest_buffer:
         raise DeviceError(
-            f"{largest} of {views.total} views must be at most {bytes_words(workspace.largest_buffer)}, the "
+            f"{largest} of {batch.total} views must be at most {bytes_words(workspace.largest_buffer)}, the "
             f"largest buffer of the device, got {bytes_words(bytes_of[largest])}; render fewer views at once"
         )
-    check_batch_memory(views.total, sum(bytes_of.values()), workspace.memory_budget)
+    check_batch_memory(batch.total, sum(bytes_of.values()), workspace.memory_budget)
     acquired = []
     for output in outputs:
         name = f"{output.name} of views"  # another pool name, as single frames must not reuse batch buffers
         buffer = workspace.pool.acquire(name, bytes_of[output.name])
         acquired.append((name, buffer))
-        if len(views) < views.total:
+        if len(batch) < batch.total:
             empty = np.full(1, output.empty_value, output.dtype)
             cl.enqueue_fill_buffer(workspace.queue, buffer, empty, 0, bytes_of[output.name])
     return acquired
@@ -62,7 +62,7 @@ class OpenCLImages(Images):
     def __init__(
         self,
         pipeline: Any,
-        views: ViewBatch | View,
+        batch: ViewBatch | View,
         rendered: list[Rendered],
         splats: int,
         acquired: list[tuple[str, cl.Buffer]] | None = None,
@@ -70,9 +70,9 @@ class OpenCLImages(Images):
     ) -> None:
         """pipeline: an OpenCLPipeline. acquired: image buffers of a batch; None for a single frame."""
         self._workspace, self._splats, self._outputs = pipeline.workspace, splats, pipeline.outputs
-        self._view = view = views if isinstance(views, View) else views.view
-        if isinstance(views, ViewBatch):
-            self.views = views.total
+        self._view = view = batch if isinstance(batch, View) else batch.view
+        if isinstance(batch, ViewBatch):
+            self.view_count = batch.total
         self._size = view.height // view.samples, view.width // view.samples
         self._rendered, self._replay = rendered, replay
         self._tile = pipeline.config.tile_height, pipeline.config.tile_width
@@ -90,7 +90,7 @@ class OpenCLImages(Images):
             images = self.empty(name)
             self._copy(name, images, index * images.nbytes)
             return images
-        shape = self.views, *self._shape(name)
+        shape = self.view_count, *self._shape(name)
         images = self._workspace.host_memory.empty(shape, self._outputs[name].dtype)
         self._copy(name, images, 0)
         return images
@@ -148,7 +148,7 @@ class OpenCLImages(Images):
             return super().device_array(name, index)
         from pyopencl.array import Array
 
-        shape, dtype = (self.views, *self._shape(name)), np.dtype(self._outputs[name].dtype)
+        shape, dtype = (self.view_count, *self._shape(name)), np.dtype(self._outputs[name].dtype)
         buffer: Any = cl.MemoryObject.from_int_ptr(self.buffer(name).int_ptr)
         # the array and its views keep these images alive, so that the pool does not reuse their buffers
         buffer.images = self

@@ -113,20 +113,20 @@ class MemoryPlanner:
         budget, largest = self._workspace.memory_budget, self._workspace.largest_buffer
         return plan_of(cloud.padded_count, record, upload_bytes, fixed, config.binning, budget, largest)
 
-    def plan_batch(self, cloud: OpenCLCloud, views: ViewBatch) -> Iterator[SubBatch]:
+    def plan_batch(self, cloud: OpenCLCloud, batch: ViewBatch) -> Iterator[SubBatch]:
         """Divide a batch into sub-batches."""
-        count, other_images = len(views), (views.total - 1) * self._image_bytes(views.view)
+        count, other_images = len(batch), (batch.total - 1) * self._image_bytes(batch.view)
         if not count:
             return
-        plan = self.plan_frame(cloud, views.view_at(0), other_images)
-        external = views.view.external_depth
-        batched = views.same_uniforms and not (cloud.streamed or self._views_differ_beyond_struct)
+        plan = self.plan_frame(cloud, batch.view_at(0), other_images)
+        external = batch.view.external_depth
+        batched = batch.same_uniforms and not (cloud.streamed or self._views_differ_beyond_struct)
         batched = batched and not (external and external.stacked)
-        if plan.slice_size or not batched or (views.camera_parameters and self._has_camera_uniforms):
+        if plan.slice_size or not batched or (batch.camera_parameters and self._has_camera_uniforms):
             for k in range(count):
-                yield SubBatch(k, k + 1, self.plan_frame(cloud, views.view_at(k), other_images))
+                yield SubBatch(k, k + 1, self.plan_frame(cloud, batch.view_at(k), other_images))
             return
-        samples, tables = self._samples_and_tables(views.view)
+        samples, tables = self._samples_and_tables(batch.view)
         splat_bytes = self._source.records["Splat"].itemsize + KEY_BYTES + WINDOW_BYTES
         splat_bytes += SORT_BYTES if self._config.binning == "sort_first" else 0
         view_bytes = cloud.padded_count * splat_bytes + tables + 4 * self._channels * samples

@@ -97,19 +97,19 @@ class OpenCLPipeline(Pipeline):
                 self._cache(cloud, key, plan)
             return OpenCLImages(self, view, [frame.rendered()], cloud.count)
 
-    def render(self, cloud: OpenCLCloud, views: ViewBatch) -> OpenCLImages:
+    def render(self, cloud: OpenCLCloud, batch: ViewBatch) -> OpenCLImages:
         """Plan and render a batch, in sub-batches of as many views as fit the memory budget."""
-        if views.is_single:
-            return self.render_view(cloud, views.view_at(0))
+        if batch.is_single:
+            return self.render_view(cloud, batch.view_at(0))
         if self._is_too_small_to_vectorise(cloud):
-            return self._with(splats_per_item=1).render(cloud, views)
+            return self._with(splats_per_item=1).render(cloud, batch)
         workspace, rendered = self.workspace, []
         with workspace.rendering():
             workspace.switch_to(workspace.queue)
-            acquired = acquire_images(workspace, self.features.images, views)
+            acquired = acquire_images(workspace, self.features.images, batch)
             images = {f"{name}_out": buffer for name, (_, buffer) in zip(self.outputs, acquired, strict=True)}
-            for first, end, plan in self._planner.plan_batch(cloud, views):
-                sub_batch = views.sub_batch(first, end)
+            for first, end, plan in self._planner.plan_batch(cloud, batch):
+                sub_batch = batch.sub_batch(first, end)
                 pipeline = self._for_sub_batch(cloud, plan, sub_batch)
                 size_key = pipeline, "views", cloud.padded_count, plan
                 workspace.pool.trim(size_key, workspace.memory_budget - plan.total)
@@ -117,7 +117,7 @@ class OpenCLPipeline(Pipeline):
                 frame.named |= images  # of the complete batch, of which these views fill a part
                 render(frame)
                 rendered.append(frame.rendered())
-            return OpenCLImages(self, views, rendered, cloud.count, acquired)
+            return OpenCLImages(self, batch, rendered, cloud.count, acquired)
 
     def fits(self, cloud: OpenCLCloud, view: View) -> bool:
         try:
@@ -265,13 +265,13 @@ class OpenCLPipeline(Pipeline):
             return self._with(culls_first=True)
         return self
 
-    def _for_sub_batch(self, cloud: OpenCLCloud, plan: MemoryPlan, views: ViewBatch) -> OpenCLPipeline:
+    def _for_sub_batch(self, cloud: OpenCLCloud, plan: MemoryPlan, batch: ViewBatch) -> OpenCLPipeline:
         """The pipeline with the fastest tile binning for a sub-batch."""
         if self.config.binning != "bin_first":
             return self
         if plan.slice_size:
             return self._in_slices()
-        few = len(views) > 1 and self._planner.tiles(views.view) <= tiling.LOCAL_TILES
+        few = len(batch) > 1 and self._planner.tiles(batch.view) <= tiling.LOCAL_TILES
         return self._with(binning="bin_local") if few or cloud.is_spatially_sorted else self
 
     def _in_slices(self) -> OpenCLPipeline:

@@ -102,9 +102,9 @@ def project(frame: DeviceFrame, first: int, end: int) -> None:
             arrays, count = {name: cloud.sorted_array(name) for name in names}, size
         else:
             arrays = {name: cloud.array_in_cloud_order(name, first, end) for name in names}
-        batch = frame.config.splats_per_item
-        items, group = (count, 64) if batch == 1 else (-(-count // batch), 1)
-        frame.launch("project", "project", (items,), (group,), frame.view_count, count=count, **arrays)
+        splats_per_item = frame.config.splats_per_item
+        items, local_size = (count, 64) if splats_per_item == 1 else (-(-count // splats_per_item), 1)
+        frame.launch("project", "project", (items,), (local_size,), frame.view_count, count=count, **arrays)
 
 
 def _splat_capacity(frame: DeviceFrame, count: int) -> int:

@@ -32,37 +32,37 @@ def scalar_arguments(view: View, source: KernelSource) -> dict[str, Any]:
 
 
 def array_arguments(
-    views: ViewBatch, source: KernelSource, row: int, end: int
+    batch: ViewBatch, source: KernelSource, row: int, end: int
 ) -> dict[str, np.ndarray | DeviceRecord]:
     """Array arguments of views by name, without those of effects, for rows of samples [row, end). Host arrays
     are read-only, so that `BufferPool.upload` copies each once."""
-    view = views.view
+    view = batch.view
     if view.sample_rows is not None:
         row, end = max(row, view.sample_rows[0]), min(end, view.sample_rows[1])
-    arrays = {"batch_indices": views.batch_indices}
+    arrays = {"batch_indices": batch.batch_indices}
     if view.groups:
         arrays["moving"] = np.array([len(view.groups), *dict(view.groups)], np.int32)
     if view.device_record is None:
-        arrays["view"] = view_records(views, row, end, source.records["View"])
+        arrays["view"] = view_records(batch, row, end, source.records["View"])
     for array in arrays.values():
         array.flags.writeable = False
     return {**arrays} if view.device_record is None else {**arrays, "view": view.device_record}
 
 
-def view_records(views: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:
+def view_records(batch: ViewBatch, row: int, end: int, record: np.dtype) -> np.ndarray:
     """Structs `View` (kernel_interface.py), (moving groups + 1, views), for rows of samples [row, end)."""
     # all members have one type
-    values, real = _record_values(views.view, row, end, record), record[0].base
-    if len(views) == 1:
-        for _, moved in views.view.groups:
+    values, real = _record_values(batch.view, row, end, record), record[0].base
+    if len(batch) == 1:
+        for _, moved in batch.view.groups:
             values += _record_values(moved, row, end, record)
         return np.array(values, real)
-    records = np.empty(views.translation.shape[:2], record)
+    records = np.empty(batch.translation.shape[:2], record)
     records[:] = np.array(values, real).view(record)
-    records["rotation"] = views.rotation.reshape(*records.shape, 9)
-    records["translation"], records["eye"] = views.translation, views.eye
-    for name in views.camera_parameters.keys() & (record.names or ()):
-        records[name] = views.camera_parameters[name]
+    records["rotation"] = batch.rotation.reshape(*records.shape, 9)
+    records["translation"], records["eye"] = batch.translation, batch.eye
+    for name in batch.camera_parameters.keys() & (record.names or ()):
+        records[name] = batch.camera_parameters[name]
     return records
 
 

@@ -63,8 +63,8 @@ class DeviceFrame:
         self.wp = load()
         view, config = batch.view, program.config
         columns, rows = -(-view.width // config.tile_width), -(-view.height // config.tile_height)
-        self.views, self.splats = len(batch), len(batch) * cloud.count
-        self.tiles = self.views * rows * columns
+        self.view_count, self.splats = len(batch), len(batch) * cloud.count
+        self.tiles = self.view_count * rows * columns
         self.grid = rows * config.tile_height, columns * config.tile_width
         """rows and columns of samples of a view"""
         self.named: dict[str, Any] = {}
@@ -154,7 +154,7 @@ class DeviceFrame:
             self.launcher.stage("resolve")
             # rays without derivatives: another struct type than for blending
             rays = rays_of(self.view, self.workspace, self.inputs)
-            count = self.views * self.view.width * self.view.height
+            count = self.view_count * self.view.width * self.view.height
             self._launch(program.composite_background, count, rays=rays, color=samples.color)
         self.stats |= {"visible": visible, "pairs": pairs}
         return samples
@@ -229,7 +229,7 @@ class DeviceFrame:
     def _samples(self, kind: str) -> Any:
         samples = self.program.samples_type()
         for name, dtype in self.program.sample_fields.items():
-            size = self.views * self.grid[0] * self.grid[1]
+            size = self.view_count * self.grid[0] * self.grid[1]
             setattr(samples, name, self._scratch(f"{kind} {name}", size, dtype))
         return samples
 
@@ -269,12 +269,12 @@ class DeviceFrame:
         }
         arguments["background"] = wp.vec3(*view.background)
         arguments["rays"] = rays_of(view, self.workspace, self.inputs, has_lens=program.has_ray_lengths)
-        launcher.launch(program.resolve, self.views * pixels, arguments)
+        launcher.launch(program.resolve, self.view_count * pixels, arguments)
         if program.sensor:
             settings = program.sensor.settings(view, self.inputs)
             arguments = {"settings": settings, "batch_indices": into.indices, "rgb": arrays["rgb"]}
             sizes = {"width": width, "pixels": pixels}
-            launcher.launch(program.sensor.kernel, self.views * pixels, arguments | sizes)
+            launcher.launch(program.sensor.kernel, self.view_count * pixels, arguments | sizes)
         launcher.stage(None)
 
     # helpers

@@ -56,17 +56,17 @@ class WarpImages(Images):
         workspace: Workspace,
         outputs: Mapping[str, Output],
         size: tuple[int, int],
-        views: int = 1,
+        view_count: int = 1,
         splats: int = 0,
     ) -> None:
         """Images of (rows, columns) pixels. Raises DeviceError if they exceed the memory budget."""
-        self._outputs, self._size, self.views, self._splats = outputs, size, views, splats
-        self.nbytes, pixels = 0, views * size[0] * size[1]
+        self._outputs, self._size, self.view_count, self._splats = outputs, size, view_count, splats
+        self.nbytes, pixels = 0, view_count * size[0] * size[1]
         sizes = {}
         for name, output in outputs.items():
             self.nbytes += 4 * pixels * output.channels
-            if views > 1:  # single frames include images in their plan
-                check_batch_memory(views, self.nbytes, workspace.memory_budget)
+            if view_count > 1:  # single frames include images in their plan
+                check_batch_memory(view_count, self.nbytes, workspace.memory_budget)
             dtype = getattr(load(), output.dtype)
             sizes[name] = pixels * output.channels, dtype
         pool = workspace.pool
@@ -95,8 +95,8 @@ class WarpImages(Images):
         output, array = self._outputs[name], self.arrays[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         if index is None:
-            return array.reshape((self.views, *shape))
-        if self.views > 1:
+            return array.reshape((self.view_count, *shape))
+        if self.view_count > 1:
             size = math.prod(shape)
             array = array[index * size : (index + 1) * size]
         return array.reshape(shape)

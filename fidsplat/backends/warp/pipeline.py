@@ -41,9 +41,9 @@ class RecordedFrame:
     frame: DeviceFrame
     graph: Any
 
-    def replay(self, views: ViewBatch) -> None:
-        if len(views) > 1 or views.view is not self.frame.view:
-            self.frame.set_views(views)
+    def replay(self, batch: ViewBatch) -> None:
+        if len(batch) > 1 or batch.view is not self.frame.view:
+            self.frame.set_views(batch)
         load().capture_launch(self.graph)
 
 
@@ -78,19 +78,19 @@ class WarpPipeline(Pipeline):
     def render_view(self, cloud: WarpCloud, view: View) -> WarpImages:
         return self.render(cloud, ViewBatch.single(view))
 
-    def render(self, cloud: WarpCloud, views: ViewBatch) -> WarpImages:
+    def render(self, cloud: WarpCloud, batch: ViewBatch) -> WarpImages:
         wp, device = load(), self.workspace.device
         with self.workspace.working("while rendering"):
-            images, into = self._new_images(cloud, views)
-            if views.is_single:
-                images.rendered.append(self._render(cloud, views, into))
+            images, into = self._new_images(cloud, batch)
+            if batch.is_single:
+                images.rendered.append(self._render(cloud, batch, into))
                 return images
-            if len(views) < views.total:
+            if len(batch) < batch.total:
                 images.blank()
-            for first, end in self._planner.plan_batch(cloud, views, images.nbytes):
-                indices = views.batch_indices[first:end].astype(np.int32)
+            for first, end in self._planner.plan_batch(cloud, batch, images.nbytes):
+                indices = batch.batch_indices[first:end].astype(np.int32)
                 indices = wp.array(indices, dtype=wp.int32, device=device)
-                sub_batch = views.sub_batch(first, end)
+                sub_batch = batch.sub_batch(first, end)
                 images.rendered.append(self._render(cloud, sub_batch, replace(into, indices=indices)))
             return images
 
@@ -98,14 +98,14 @@ class WarpPipeline(Pipeline):
         """Render one view and wait. Returns the images, and the frame, which is valid until the next
         frame."""
         with self.workspace.working("while rendering"):
-            views = ViewBatch.single(view)
-            images, into = self._new_images(cloud, views)
-            frame, rendered = self._render_counted(cloud, views, into)
+            batch = ViewBatch.single(view)
+            images, into = self._new_images(cloud, batch)
+            frame, rendered = self._render_counted(cloud, batch, into)
             images.rendered.append(rendered)
             return frame, images
 
-    def _new_images(self, cloud: WarpCloud, views: ViewBatch) -> tuple[WarpImages, ImageArrays]:
-        images = WarpImages(self.workspace, self.outputs, views.size, views.total, cloud.count)
+    def _new_images(self, cloud: WarpCloud, batch: ViewBatch) -> tuple[WarpImages, ImageArrays]:
+        images = WarpImages(self.workspace, self.outputs, batch.size, batch.total, cloud.count)
         return images, ImageArrays(images.allocate, self.workspace.first_index, images.nbytes)
 
     def render_intermediates(self, cloud: WarpCloud, view: View) -> dict[str, np.ndarray]:
@@ -127,50 +127,50 @@ class WarpPipeline(Pipeline):
         }
 
     def _render_counted(
-        self, cloud: WarpCloud, views: ViewBatch, into: ImageArrays
+        self, cloud: WarpCloud, batch: ViewBatch, into: ImageArrays
     ) -> tuple[DeviceFrame, Rendered]:
         launcher = Launcher(self._launches)
-        frame = DeviceFrame(self.program, self._planner, cloud, views, launcher, into.reserved)
+        frame = DeviceFrame(self.program, self._planner, cloud, batch, launcher, into.reserved)
         self.workspace.frames += 1
         frame.render()
-        if not views.view.sub_frames:
-            self._update_capacity(cloud, views, frame.stats["pairs"])
+        if not batch.view.sub_frames:
+            self._update_capacity(cloud, batch, frame.stats["pairs"])
         frame.resolve(into, launcher)
         return frame, Rendered(launcher, frame.stats)
 
-    def _render(self, cloud: WarpCloud, views: ViewBatch, into: ImageArrays) -> Rendered:
+    def _render(self, cloud: WarpCloud, batch: ViewBatch, into: ImageArrays) -> Rendered:
         """Render views, without waiting if a frame with the same key is cached."""
-        workspace, view = self.workspace, views.view
+        workspace, view = self.workspace, batch.view
         # frames of the user's own arrays (`wrap_arrays`) must wait for their counts: a frame that overflows
         # its buffers is rendered again, and by then the user may have changed the arrays
         if not workspace.asynchronous or view.sub_frames or cloud.wraps_arrays or not cloud.count:
-            return self._render_counted(cloud, views, into)[1]
-        cached = self._cached.get(cloud, {}).get((view.width, view.height, len(views)))
+            return self._render_counted(cloud, batch, into)[1]
+        cached = self._cached.get(cloud, {}).get((view.width, view.height, len(batch)))
         if cached is None:
-            return self._render_counted(cloud, views, into)[1]
+            return self._render_counted(cloud, batch, into)[1]
         # after a failure or another frame the inputs are undefined
         capacity, recorded, cached.recorded = cached.capacity, cached.recorded, None
         if recorded is not None and cached.token == self._token(cached, view, into.reserved):
-            recorded.replay(views)
+            recorded.replay(batch)
             cached.recorded = recorded
             workspace.frames += 1
             launcher = Launcher(self._launches, timed=False)
-            return self._pending(cloud, views, capacity, recorded.frame, launcher, into)
+            return self._pending(cloud, batch, capacity, recorded.frame, launcher, into)
         launcher = Launcher(self._launches)
         given = into.reserved, capacity, cached.inputs
-        frame = DeviceFrame(self.program, self._planner, cloud, views, launcher, *given)
+        frame = DeviceFrame(self.program, self._planner, cloud, batch, launcher, *given)
         if not frame.fits(capacity):
-            return self._render_counted(cloud, views, into)[1]
+            return self._render_counted(cloud, batch, into)[1]
         workspace.frames += 1
         frame.render()
-        rendered = self._pending(cloud, views, capacity, frame, launcher, into)
+        rendered = self._pending(cloud, batch, capacity, frame, launcher, into)
         self._record(cached, frame, into.reserved)
         return rendered
 
     def _pending(
         self,
         cloud: WarpCloud,
-        views: ViewBatch,
+        batch: ViewBatch,
         capacity: int,
         frame: DeviceFrame,
         launcher: Launcher,
@@ -194,16 +194,16 @@ class WarpPipeline(Pipeline):
             if pairs <= capacity:
                 return None
             with workspace.working("while rendering"):
-                return self._render_counted(cloud, views, into)[1]
+                return self._render_counted(cloud, batch, into)[1]
 
         def profile() -> Mapping[str, float]:
             """Measure the stages by rendering again: one view into new arrays, a batch into its own."""
             with workspace.working("while rendering"):
                 own = into
-                if len(views) == 1:
+                if len(batch) == 1:
                     arrays = {name: load().empty_like(array) for name, array in into.allocate().items()}
                     own = replace(into, allocate=lambda: arrays)
-                return self._render_counted(cloud, views, own)[1].timings()
+                return self._render_counted(cloud, batch, own)[1].timings()
 
         rendered.complete = complete
         if not launcher.timed:
@@ -231,8 +231,8 @@ class WarpPipeline(Pipeline):
         external = view.external_depth and view.external_depth.depth.shape
         return cached.capacity, budgets, states, view.raster, view.environment_map, labels, external
 
-    def _update_capacity(self, cloud: WarpCloud, views: ViewBatch, pairs: int) -> None:
-        kinds, kind = self._cached.setdefault(cloud, {}), (views.view.width, views.view.height, len(views))
+    def _update_capacity(self, cloud: WarpCloud, batch: ViewBatch, pairs: int) -> None:
+        kinds, kind = self._cached.setdefault(cloud, {}), (batch.view.width, batch.view.height, len(batch))
         cached = kinds.get(kind)
         if cached is None:
             if len(kinds) >= _MAX_KINDS:
