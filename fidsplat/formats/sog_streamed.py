@@ -30,7 +30,7 @@ _UNIT = 2**19
 
 @dataclass(frozen=True)
 class Span:
-    """Range of splats in a file, given by its index."""
+    """Range of splats in a file. file: index of `StreamedSog.files`."""
 
     file: int
     first: int

@@ -104,8 +104,8 @@ def _halves(
 
 
 def _rotated(pieces: np.ndarray, boxes: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Pieces of boxes that are rotated about the centres of the boxes, moved for a rotation about their
-    own."""
+    """Pieces of rotated boxes, moved such that a rotation of each piece about its own centre has the same
+    result as the rotation of its box about the centre of the box."""
     before, about = ((array[:, :2] + array[:, 2:]) / 2 for array in (pieces, boxes))
     (x, y), c, s = (before - about).T, np.cos(angles), np.sin(angles)
     step = about + np.column_stack([c * x - s * y, s * x + c * y]) - before

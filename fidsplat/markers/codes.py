@@ -1,7 +1,7 @@
 """Tags, QR codes and images as markers: parsing of their specs, and their modules.
 
-Tags are those of OpenCV's predefined dictionaries and of AprilTag 3; segno encodes QR codes, in byte mode;
-images have two grey levels and one pixel per module.
+Families of tags are OpenCV's predefined dictionaries and those of AprilTag 3; segno encodes QR codes, in
+byte mode; images have two grey levels and one pixel per module.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ EDGE = 16
 _DISK, _CODE, _FILLER = 0.4, 0.7 * 0.062482177287080, 0.7 * 0.7 * 0.062482177287080
 """radii of the white disk, a code circle, and a circle between neighbours, relative to the edge"""
 _NEAR = 0.7 * 4 * 0.062482177287080
-"""distance below which dark code circles are joined"""
+"""distance, relative to the edge, below which dark code circles are joined"""
 _SMOOTHED = 0.015
 """radius of the smoothing of the outline between code circles, relative to the edge"""
 _CORRECTED = 2

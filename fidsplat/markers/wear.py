@@ -66,7 +66,7 @@ class Wear:
     coarseness: float = 0.0
     """dots of the printer, 1.5 modules wide at 1"""
     fading: float = 0.0
-    """contrast lost by the ink"""
+    """fraction of the ink's contrast that is lost"""
     dirt: float = 0.0
     """fraction of the sheet with dirt"""
     drops: float = 0.0

@@ -6,7 +6,7 @@
 #endif
 
 // Index space: (words of the largest copy, copies). Reads: copies (source row, target row, rows, pose or NO_POSE), source.
-// Writes: target. words: per row.
+// Writes: target. words: number of words of a row.
 kernel void gather(global const uint *source, global const uint4 *copies, uint words, global uint *target) {
     uint4 copy = copies[get_global_id(1)];
     ulong word = get_global_id(0);
