@@ -204,8 +204,8 @@ class OpenCLAlignment(AlignmentKernels):
                     perturbed.frame.images.buffer("rgb"), args, "perturbed frame", 3
                 )
                 args |= {"has_perturbed": 1, "step": perturbed.size, "axis": perturbed.axis}
-            self._clear_errors()
-            self._launch("align_errors", *self._errors_size(args), args)
+            self._clear_residual_histogram()
+            self._launch("align_errors", *self._residual_grid(args), args)
             self._launch("align_sums", *self._sums_size(groups, channels), args)
             packed = self._read(args["result"], (groups, _GROUP_FLOATS))
         return _unpacked(packed, channels, blocks, perturbed is not None)
@@ -217,7 +217,7 @@ class OpenCLAlignment(AlignmentKernels):
                 commands, channels = self._score_commands(stage, replayed, len(at.fit.gain)), len(at.fit.gain)
                 replayed.set_pose(at.pose)
                 self._copy(commands.state, _packed_fit(at.fit))
-                self._clear_errors()
+                self._clear_residual_histogram()
                 replayed.submit()
                 commands.sums[0].submit(self._queue)
                 packed = self._read(commands.result, (commands.groups, _GROUP_FLOATS))
@@ -277,7 +277,7 @@ class OpenCLAlignment(AlignmentKernels):
         state[_CONVERGED], state[_EXPOSURE_KNOWN] = 1, exposure_known
         self._copy(stage_commands[0].state, state)
         before = self._upload("first pose", replayed.packed(at.pose))
-        self._clear_errors()
+        self._clear_residual_histogram()
         for (_, limit), commands in zip(steps, stage_commands, strict=True):
             commands.steps.set({"before": before})
             commands.steps.submit(queue, 0, 1)
@@ -337,7 +337,7 @@ class OpenCLAlignment(AlignmentKernels):
             if args["reduced"] is not None:
                 own = {"channels": 3, "image": replayed.images[False]["rgb_out"], "result": args["reduced"]}
                 self._launch("align_downsample", grid, (64, 1), args | own, sums)
-            self._launch("align_errors", *self._errors_size(args), args, sums)
+            self._launch("align_errors", *self._residual_grid(args), args, sums)
             self._launch("align_sums", *self._sums_size(groups, channels), args, sums)
             self._launch("align_start", (1,), (1,), args, commands.steps)
             self._launch("align_step", (BINS,), (BINS,), args, commands.steps)
@@ -364,7 +364,7 @@ class OpenCLAlignment(AlignmentKernels):
                 args |= {"has_perturbed": 1, "axis": axes[row - 1] % 3, "groups": groups}
                 args["result"] = self._scratch("sums", 4 * groups * _GROUP_FLOATS)
             else:
-                self._launch("align_errors", *self._errors_size(args), args, sums)
+                self._launch("align_errors", *self._residual_grid(args), args, sums)
             self._launch("align_sums", *self._sums_size(groups, channels), args, sums)
             self._launch("align_step", (BINS,), (BINS,), args | {"axis": axis, "row": row}, commands.steps)
         commands.steps.key = self._workspace.pool.generation, *commands.steps.key[1:]
@@ -438,18 +438,18 @@ class OpenCLAlignment(AlignmentKernels):
             **{"rendered": rendered, "rgb": blurred, "depth": depth, "perturbed": blurred},
             **{"has_perturbed": 0, "step": 1.0, "axis": 0, "huber": int(huber)},
             **{"depth_width": args["width"], "ratio_x": 1.0, "ratio_y": 1.0},
-            "counts": self._errors(),
+            "counts": self._residual_histogram(),
             "result": self._scratch("sums", 4 * groups * _GROUP_FLOATS),
             "noise_factor": noise_factor(channels),
         }
 
-    def _errors(self) -> cl.Buffer:
+    def _residual_histogram(self) -> cl.Buffer:
         """Histogram of the residuals (BINS,) uint32."""
-        return self._scratch("errors", 4 * BINS)
+        return self._scratch("residual histogram", 4 * BINS)
 
-    def _clear_errors(self) -> None:
+    def _clear_residual_histogram(self) -> None:
         """Clear the histogram of residuals, to which `align_errors` adds; a step clears it too."""
-        cl.enqueue_fill_buffer(self._queue, self._errors(), _ZERO, 0, 4 * BINS)
+        cl.enqueue_fill_buffer(self._queue, self._residual_histogram(), _ZERO, 0, 4 * BINS)
 
     @property
     def _queue(self) -> cl.CommandQueue:
@@ -480,7 +480,7 @@ class OpenCLAlignment(AlignmentKernels):
             image = result
         return image
 
-    def _errors_size(self, args: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    def _residual_grid(self, args: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
         spans = -(-args["width"] * args["height"] // self._items)
         return self._size(min(spans, 4096 if self._items > 1 else _GROUPS[1]))
 
