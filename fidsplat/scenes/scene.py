@@ -22,8 +22,6 @@ from fidsplat.util.progress import Progress
 
 if TYPE_CHECKING:
     from fidsplat.markers import Marker
-    from fidsplat.render.renderer import Renderer
-    from fidsplat.render.resident import ResidentCloud
 
 
 class Scene(SceneParts, Summarised):
@@ -77,8 +75,8 @@ class Scene(SceneParts, Summarised):
         *,
         ray: Any = None,
         radius: float | None = None,
-        renderer: Renderer | None = None,
-        resident: ResidentCloud | None = None,
+        renderer: Any = None,
+        resident: Any = None,
     ) -> Surface:
         """Position and normal of the surface at a pixel or along a ray, from rendered depth; see
         `fs.surface_at`.
@@ -103,8 +101,8 @@ class Scene(SceneParts, Summarised):
         lift: float | None = None,
         bundle: str | None = None,
         light: Any = None,
-        renderer: Renderer | None = None,
-        resident: ResidentCloud | None = None,
+        renderer: Any = None,
+        resident: Any = None,
     ) -> Scene:
         """The scene with one more marker, upright on the surface at a pixel or along a ray.
 
