@@ -167,7 +167,7 @@ def test_half_precision_has_the_same_bits_in_both_schedules_and_words(opencl, mo
         with monkeypatch.context() as patch:
             patch.setattr(assembly, "_dialect", lambda *_: [str(file)])
             packed = backend.pipeline(features, replace(groups, tape=1))
-        assert "word_fma" in packed.source.text
+            assert "word_fma" in packed.source.text
         words = packed.render_intermediates(backend.upload(cloud), view)
         for name in capture.outputs:
             assert np.array_equal(plain[name], expected[name])
