@@ -150,7 +150,10 @@ def check_bounds(error: float | None, ms: float | None) -> None:
 
 def _color_range(value: Any) -> float:
     if not 0 < (number := as_float(value)) < math.inf:
-        raise InputError(f"colors must be a positive range, got {value!r}; give the largest colour, e.g. 1.0")
+        raise InputError(
+            f"colors must be a positive number, got {value!r}; give the largest minus the smallest colour, "
+            "e.g. 1.0"
+        )
     return number
 
 

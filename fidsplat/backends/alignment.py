@@ -91,9 +91,9 @@ class PerturbedFrame(NamedTuple):
     size: float
     """size of the motion [rad or m]"""
     axis: int
-    """component (0: x, 1: y) of the motion, and of the pixel's ray (x, y, 1). With d the derivative with
-    respect to this motion and r the component of the ray, -r d is a part of the derivative with respect to
-    the motion along (or about) z"""
+    """component of the motion: 0 for x, 1 for y, 2 for z. Without a lens, a pixel has the ray (x, y, 1), and
+    the derivative with respect to the motion along (or about) z is -x d_x - y d_y, with d_x and d_y the
+    derivatives with respect to the motions along (or about) x and y"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,8 @@ class AlignmentSums:
 
 
 class Score(NamedTuple):
-    """Sums at a pose, and derivatives of the score: of the gradient of the loss."""
+    """Sums at a pose, and finite differences of the score, which is the gradient of the loss with respect to
+    the pose."""
 
     sums: AlignmentSums
     derivatives: dict[int, np.ndarray]

@@ -266,10 +266,13 @@ class GradientPipeline(ABC):
     def forward(self, cloud: Any, view: View, waits: bool = True) -> Any:
         """Render one view of an uploaded cloud, bit-identical to `Pipeline.render`, for a later `backward`.
 
-        waits: whether to wait until the number of (splat, tile) pairs shows that the buffers were large
-        enough. If not, `backward` may raise CapacityExceeded, and the frame must be discarded. Raises
-        DeviceError if the frame does not fit the memory budget in one piece, as a frame that is rendered in
-        ranges of tiles or projected in slices has no gradient.
+        Args:
+            waits: whether to wait until the number of (splat, tile) pairs shows that the buffers were large
+                enough. With False, `backward` may raise CapacityExceeded; the frame must then be discarded.
+
+        Raises:
+            DeviceError: the frame does not fit the memory budget in one piece; a frame that is rendered in
+                ranges of tiles or projected in slices has no gradient.
         """
 
     @abstractmethod
@@ -401,9 +404,12 @@ class Backend(ABC):
     def configs(self, kind: str) -> dict[str, Any]:
         """Alternative build constants by name, with which tests compile the same features.
 
-        kind: `tiles` or `k_buffer`: another tile or k-buffer size, with bit-identical images; `tape`: fewer
-        fragments are stored for the backward pass; `binning`, `sorting`: another method of tile binning or
-        sorting; `schedule`: work is assigned to threads as on a GPU; `arithmetic`: without fused
-        multiply-adds or vectors.
+        Args:
+            kind: what differs. With `tiles` and `k_buffer`, images are bit-identical.
+                `tiles`, `k_buffer`: size of the tiles, of the k-buffer.
+                `tape`: number of fragments that are stored for the backward pass.
+                `binning`, `sorting`: method of tile binning, of sorting.
+                `schedule`: work is assigned to threads as on a GPU.
+                `arithmetic`: no fused multiply-adds, or no vectors.
         """
         return {}

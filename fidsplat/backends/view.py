@@ -34,7 +34,7 @@ def moved_pose(
     rotation: np.ndarray, translation: np.ndarray, motion: np.ndarray, origin: np.ndarray, parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotation, translation and eye of `View` for splats that are moved by rigid motions (..., 4, 4) in world
-    coordinates. rotation, translation: those of unmoved splats, (..., 3, 3) and (..., 3)."""
+    coordinates. rotation (..., 3, 3), translation (..., 3): of the view without motions."""
     group_rotation, group_translation = motion[..., :3, :3], motion[..., :3, 3]
     moved_rotation = rotation @ group_rotation
     origins = np.broadcast_to(origin, group_translation.shape)

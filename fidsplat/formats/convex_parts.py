@@ -151,7 +151,7 @@ class _Surface:
 
 
 def _components(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """Number of the connected component of each face."""
+    """Label of the connected component of each face: the lowest index of the component's vertices."""
     labels = np.arange(vertices)
     while True:
         smallest = labels[faces].min(axis=1)

@@ -17,18 +17,19 @@ where the first term is measured, for any requested quality, and the second is b
    of Q and R the range of the colours.
 2. A fragment that Q omits has an alpha below e. There are at most n per pixel: n e R = `MAX_OMITTED` R. The
    radius of a footprint grows with sqrt(ln(1 / e)), so that Q has about twice the fragments of the default.
-3. Interval arithmetic over the rounding of the ray-splat intersection returns an interval that contains the
-   exact alpha of a fragment of Q, also where rounding decides whether the fragment exists: at the near plane,
-   where the ray is parallel to the splat's plane, and at the edge of the footprint. Kernels sum T_k times the
-   distance of alpha from the farther end of its interval: the internal output `rounding`
-   (kernels/opencl/output/rounding.cl).
-4. Rounding T changes the colour behind a fragment by at most 2^-24 T C. Rounding the colour sum changes it by
-   at most 2^-24 (1 - T) C. C is the largest absolute colour. Both together change it by at most 2^-24 C per
-   fragment. Rounding the products T alpha and T alpha c adds at most 2^-24 C each for all fragments of a
-   pixel together. The sum for m fragments is (m + 2) 2^-24 C. The kernels add 1.5 instead of 1 per
-   fragment, as a margin for second-order terms, to `rounding`; `error_reference` adds the 2. It also adds
-   2^-24 C for each rounding of the sums over samples, over sub-frames (the camera poses that a shutter
-   averages) and over spherical harmonics.
+3. Each alpha of Q has a rounding error, from the ray-splat intersection. Interval arithmetic computes an
+   interval that contains the exact alpha. Rounding can also decide whether a fragment exists: at the near
+   plane, where the ray is parallel to the splat's plane, and at the edge of the footprint. The intervals
+   include these cases. The kernels compute the distance of alpha from the farther end of its interval, and
+   sum T_k times this distance: the internal output `rounding` (kernels/opencl/output/rounding.cl).
+4. Compositing has rounding errors too. C is the largest absolute colour, m the number of fragments at a
+   pixel.
+   - Rounding T changes the colour behind a fragment by at most 2^-24 T C, and rounding the colour sum changes
+     the sum by at most 2^-24 (1 - T) C. For m fragments, both together are at most m 2^-24 C.
+   - Rounding the products T alpha and T alpha c adds at most 2^-24 C each for all fragments together.
+   The total is (m + 2) 2^-24 C. The kernels add 1.5 x 2^-24 C per fragment to `rounding`: 1 and a margin for
+   second-order terms. `error_reference` adds 2 x 2^-24 C. It also adds 2^-24 C for each rounding of the sums
+   over samples, over sub-frames (the camera poses that a shutter averages) and over spherical harmonics.
 
 R and C are bounded by the colours of all splats and of the background. Q is composited in float64 if an
 effect is not in `_BOUNDED` or rgb is composited in float64. Then only the conversion of its image to float32

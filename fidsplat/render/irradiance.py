@@ -101,8 +101,8 @@ class LightField:
                 _difference(irradiance[::2, 1::2], (coarse[:, 1:] + coarse[:, :-1]) / 2),
                 _difference(irradiance[1::2, ::2], (coarse[1:] + coarse[:-1]) / 2),
             )
-            # `error` is that of the coarser grid; the error of this grid, with half the spacing, is at most
-            # half of it
+            # `error` is the interpolation error of the coarser grid; the error of this grid, with half the
+            # spacing, is at most half of it
             if error <= tolerance * irradiance.max():
                 break
         return field

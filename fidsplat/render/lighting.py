@@ -1,6 +1,6 @@
 """Lighting of markers: colours of their splats from the light of the scene. Panoramas measure the radiance
-around a marker, and shadow maps the visibility of `Scene.lights`. Box splats (the hard-edged rectangles of
-which markers consist) are split where the light changes.
+around a marker. Shadow maps measure the visibility of `Scene.lights`. Box splats (the hard-edged rectangles
+of which markers consist) are split where the light changes.
 """
 
 from __future__ import annotations

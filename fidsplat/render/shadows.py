@@ -178,7 +178,7 @@ def _camera(point: LightPoint, surface: ReceiverPoints, extent: float) -> Camera
 
 
 def _depth_image(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Depth (h, w) of a surface: the plane through points (m, 3), plus their distances from it."""
+    """Depth (h, w) of a surface: a plane fitted to points (m, 3), plus their residuals."""
     pixels = camera.project(points)
     z = (points - camera.position) @ camera.world_to_camera[2, :3]
     inverse = not isinstance(camera.lens, Orthographic)  # 1 / z of a plane is affine in the pixel

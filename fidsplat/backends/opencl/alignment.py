@@ -41,13 +41,13 @@ _GROUPS = {1: 32, 64: 1024}
 """maximum number of work-groups of a sum, by the size of a work-group"""
 _GROUP_FLOATS = 249
 """floats that a work-group writes: SUMS of alignment.cl, and the noise"""
-_STATE = 224
-"""floats of the buffer `state` (alignment_step.cl); the host reads the first `_READ`"""
-_CONVERGED, _NOISE, _INCOMPLETE, _EXPOSURE_KNOWN, _READ = range(7, 12)
+_STATE, _STATE_READ = 224, 11
+"""floats of the buffer `state` (alignment_step.cl), and how many of them the host reads"""
+_CONVERGED, _NOISE, _INCOMPLETE, _EXPOSURE_KNOWN = range(7, 11)
 """indices in `state`, after gain, offset and noise of the next frame"""
 _POSE = 15
 """numbers of the pose of a view: rotation, translation and eye"""
-_FEW = 4
+_FIRST_CHECK = 4
 """number of steps after which the host first reads whether a stage with at least twice as many has
 converged"""
 _ATTEMPTS = 8
@@ -69,7 +69,7 @@ class OpenCLAlignment(AlignmentKernels):
         """programs of `align_step`, by whether view records are float64"""
         self._lists: dict[Any, _StageCommands] = {}
         """command lists of steps, by stage and whether the views are float64; and of scores"""
-        self._replays: WeakKeyDictionary[Any, dict[Any, _Replayed]] = WeakKeyDictionary()
+        self._replays: WeakKeyDictionary[Any, dict[Any, _PoseReplay]] = WeakKeyDictionary()
         self._stage_arguments: list[dict[str, Any]] = []
         """kernel arguments of each stage"""
         self._thresholds: np.ndarray | None = None
@@ -163,9 +163,9 @@ class OpenCLAlignment(AlignmentKernels):
         self._launch("align_texture", *self._size(self._rows(height)), args, self._pyramid_commands)
         return args, (image, (height, width, channels))
 
-    def _replay(self, pose: np.ndarray) -> _Replayed | None:
-        """The replayed frames of the last stage. GPUs reduce them for the other stages: the pixels of smaller
-        frames have more splats, which a work-item blends one by one. None if the frames cannot be replayed:
+    def _replay(self, pose: np.ndarray) -> _PoseReplay | None:
+        """The replayed frames of the last stage. GPUs downsample them for the coarser stages instead of
+        rendering small frames, which have few tiles with long lists. None if the frames cannot be replayed:
         on CPUs, beyond the memory budget, for an empty cloud, with moving groups, a shutter or parallel rays.
         pose: any valid pose."""
         camera, cloud = self._stages[-1].camera, self._scene.cloud
@@ -177,7 +177,7 @@ class OpenCLAlignment(AlignmentKernels):
             if len(replays) >= _MAX_REPLAYS:
                 replays.clear()
             pipeline, view, origin = self._scene.prepared(camera.with_pose(pose))
-            replayed = _Replayed.of(self._workspace, pipeline, cloud, view, origin)
+            replayed = _PoseReplay.of(self._workspace, pipeline, cloud, view, origin)
             if replayed is None:
                 return None
             replays[key] = replayed
@@ -247,7 +247,7 @@ class OpenCLAlignment(AlignmentKernels):
 
     def _recorded(
         self, at: Estimate, steps: Sequence[tuple[int, int]], last: int | None, tolerance: float
-    ) -> tuple[_Replayed, list[_StageCommands], _StageCommands | None] | None:
+    ) -> tuple[_PoseReplay, list[_StageCommands], _StageCommands | None] | None:
         """Frames, commands of each stage, and of the score at the stage `last`. None if the frames cannot be
         replayed."""
         channels, pool = len(at.fit.gain), self._workspace.pool
@@ -265,7 +265,7 @@ class OpenCLAlignment(AlignmentKernels):
         self,
         at: Estimate,
         steps: Sequence[tuple[int, int]],
-        replayed: _Replayed,
+        replayed: _PoseReplay,
         stage_commands: list[_StageCommands],
         score_commands: _StageCommands | None,
     ) -> tuple[np.ndarray, np.ndarray, Score | None]:
@@ -285,8 +285,8 @@ class OpenCLAlignment(AlignmentKernels):
             for step in range(limit if exposure_known else limit + 1):
                 # wait only where convergence is likely, so that frames are submitted while the device works
                 if (
-                    step >= (_FEW if limit >= 2 * _FEW else 1)
-                    and self._read(commands.state, (_READ,))[_CONVERGED]
+                    step >= (_FIRST_CHECK if limit >= 2 * _FIRST_CHECK else 1)
+                    and self._read(commands.state, (_STATE_READ,))[_CONVERGED]
                 ):
                     break
                 # the first sums only determine the exposure, if it is unknown: the pose stays the same
@@ -306,7 +306,7 @@ class OpenCLAlignment(AlignmentKernels):
                 commands.steps.submit(queue, step, step + 1)
                 queue.flush()
             score = self._read_score(commands, channels)
-        state = self._read(stage_commands[0].state, (_READ,))
+        state = self._read(stage_commands[0].state, (_STATE_READ,))
         # a score leaves its pose in `pose`; the last step is in the view
         source = replayed.view if score_commands is None else score_commands.pose
         return state, replayed.world_to_camera(self._read(source, (_POSE,), replayed.record.dtype)), score
@@ -325,7 +325,7 @@ class OpenCLAlignment(AlignmentKernels):
         )
 
     def _step_commands(
-        self, stage: int, replayed: _Replayed, channels: int, tolerance: float
+        self, stage: int, replayed: _PoseReplay, channels: int, tolerance: float
     ) -> _StageCommands:
         """Commands of Levenberg-Marquardt at a stage."""
         args, groups = self._stage_arguments[stage], self._groups(self._stage_arguments[stage], False)
@@ -345,7 +345,7 @@ class OpenCLAlignment(AlignmentKernels):
             commands.steps.key = self._workspace.pool.generation, *commands.steps.key[1:]
         return commands
 
-    def _score_commands(self, stage: int, replayed: _Replayed, channels: int) -> _StageCommands:
+    def _score_commands(self, stage: int, replayed: _PoseReplay, channels: int) -> _StageCommands:
         """Commands of the score: sums of the frame by blocks, and of the perturbed frames."""
         args, axes = self._stage_arguments[stage], (*self.axes(stage), 6)
         commands, is_recorded = self._stage_commands(("score", stage), replayed, (channels,), len(axes))
@@ -371,7 +371,7 @@ class OpenCLAlignment(AlignmentKernels):
         return commands
 
     def _stage_commands(
-        self, name: tuple[str, int], replayed: _Replayed, parameters: tuple[Any, ...], count: int
+        self, name: tuple[str, int], replayed: _PoseReplay, parameters: tuple[Any, ...], count: int
     ) -> tuple[_StageCommands, bool]:
         """Cached commands, and whether they are recorded; `count` lists of sums. parameters: values of kernel
         arguments."""
@@ -389,7 +389,7 @@ class OpenCLAlignment(AlignmentKernels):
         return commands, False
 
     def _replayed_arguments(
-        self, args: dict[str, Any], replayed: _Replayed, channels: int, huber: bool, groups: int
+        self, args: dict[str, Any], replayed: _PoseReplay, channels: int, huber: bool, groups: int
     ) -> dict[str, Any]:
         """Arguments of all kernels of a step."""
         image, depth = (replayed.images[False][name] for name in ("rgb_out", "depth_out"))
@@ -532,7 +532,7 @@ class _StageCommands:
         self.result, self.groups = args["result"], args["groups"]
 
 
-class _Replayed:
+class _PoseReplay:
     """Frames of a stage at any pose, by one command list."""
 
     def __init__(
@@ -558,7 +558,7 @@ class _Replayed:
     @classmethod
     def of(
         cls, workspace: Workspace, pipeline: Any, cloud: Any, view: View, origin: np.ndarray
-    ) -> _Replayed | None:
+    ) -> _PoseReplay | None:
         """Frames with the size and effects of a view; None if they cannot be replayed."""
         plain = not (view.groups or view.sub_frames or view.parallel) and cloud.count
         if pipeline.config.binning == "sort_first" or not plain or not pipeline.fits(cloud, view):
@@ -571,7 +571,8 @@ class _Replayed:
             for output in pipeline.outputs.values()
         }
         workspace.pool.scratch(_name_of(view), pipeline.source.records["View"].itemsize)
-        # a limit that no other caller gives, as the buffer of the view is its own
+        # a pair limit that no other caller uses, so that the recording is not shared: its buffer of the
+        # record `View` is not the pool's `view`
         frame = pipeline.replay_undivided(cloud, view, sys.maxsize)
         owner = pipeline.images_of(frame)
         replayed = None if frame.recorded is None else cls(workspace, frame, owner, origin, scratch)
@@ -585,7 +586,7 @@ class _Replayed:
         if workspace.frames != self._number:
             if not self._recorded.set_view(self._template, queue):
                 return False
-            # kernels overwrite its pose; another capture overwrites all of it
+            # kernels overwrite the pose in the buffer `view`; frames of another capture overwrite all of it
             self.view, self._upload = workspace.pool.upload(queue, _name_of(self._template), self.record)
             self._recorded.commands.set({"frame_counts": self._counts, "view": self.view})
         return True
@@ -606,7 +607,8 @@ class _Replayed:
         return packed
 
     def set_pose(self, pose: np.ndarray) -> None:
-        """Set the pose; without a step, the near plane is that of the view."""
+        """Set the pose, and reset the near plane, which a converged stage sets to infinity
+        (alignment_step.cl)."""
         record = self.record.copy()
         record[:_POSE] = self.packed(pose)
         self._upload = cl.enqueue_copy(self._queue, self.view, record, is_blocking=False)

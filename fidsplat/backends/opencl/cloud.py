@@ -55,8 +55,8 @@ class OpenCLCloud(DeviceCloud):
 
     @abstractmethod
     def array_in_cloud_order(self, name: str, first: int, end: int) -> cl.Buffer:
-        """The array of splats [first, end) in the order of the cloud. It replaces an array in Morton order
-        for good, and releases the cached command lists that read it."""
+        """The array of splats [first, end) in the order of the cloud. An UploadedCloud then permanently
+        replaces its arrays in Morton order, and releases the cached command lists that read them."""
 
     def sorted_array(self, name: str) -> cl.Buffer:
         """The array of all splats in Morton order, the same for all arrays."""

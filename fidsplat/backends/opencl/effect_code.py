@@ -263,7 +263,8 @@ EFFECT_CODE: dict[str, EffectCode] = {
     "row_rotation": EffectCode(
         "part/row_rotation.cl", resolve=args("array float row_rotations  // (h, 3, 3)")
     ),
-    # rays of fisheyes and panoramas have a length of 1
+    # length of a ray per unit of depth along z, which converts depth to distance; 1 for fisheyes and
+    # panoramas, whose depths are distances
     "pinhole_ray_length": EffectCode(
         "part/pinhole_ray_length.cl", replaced_by=(("camera_brown_conrady", "lens_ray_length"),)
     ),

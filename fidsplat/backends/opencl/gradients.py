@@ -45,7 +45,7 @@ _SUMS = {"background": 3, "pose": 6, "intrinsics": 4}
 """gradients that are sums over tiles or splats, and their number of components"""
 _CAMERA = 10  # pose and intrinsics
 _REFINE_ITEMS = 240  # of kernels/opencl/train/refine_view.cl
-_DOING = "taking derivatives"
+_ERROR_CONTEXT = "taking derivatives"
 _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # also zeroes floats
 
@@ -85,7 +85,7 @@ class OpenCLGradients(GradientPipeline):
         self.step_commands: dict[bool, CommandList] = {}
         """command lists of `TileGradients.step`, without and with refinement of views"""
         self.frame_arguments: dict[bool, dict[str, Argument]] = {}
-        """arguments of their kernels that frames define"""
+        """arguments of the step kernels whose values come from the frame"""
 
     def forward(self, cloud: OpenCLCloud, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """Render one frame. waits: whether to wait for its counts, as the first frame on a GPU must."""
@@ -105,7 +105,7 @@ class OpenCLGradients(GradientPipeline):
         check_gradients(self.features, gradients)
         if not images.is_latest:
             raise InputError(NOT_LATEST_FRAME)
-        with images.frame.workspace.lock, images.frame.workspace.device_errors(_DOING):
+        with images.frame.workspace.lock, images.frame.workspace.device_errors(_ERROR_CONTEXT):
             frame = self._backward_frame(images.frame)
             self._submit_blend_backward(frame, gradients)
             return TileGradients(self, images, frame)
@@ -249,7 +249,7 @@ class TileGradients:
 
         Args:
             arguments: values that the frame does not define.
-            constants: more of them, which are equal in all steps of a version.
+            constants: further values, which are equal in all steps with the same `version`.
             next_record: record of the next frame's camera, if views are refined
                 (kernels/opencl/train/refine_view.cl).
         """
@@ -289,7 +289,7 @@ class TileGradients:
         """Lock the device. Raises InputError if it has rendered another frame since."""
         if not self._images.is_latest:
             raise InputError(NOT_LATEST_FRAME)
-        with self._frame.workspace.lock, self._frame.workspace.device_errors(_DOING):
+        with self._frame.workspace.lock, self._frame.workspace.device_errors(_ERROR_CONTEXT):
             yield
 
     def _allocate_camera_sums(self, frame: DeviceFrame) -> int:

@@ -48,7 +48,7 @@ class HostMemory:
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self.pins_memory = not device.type & cl.device_type.CPU
-        """whether to pin memory; on a CPU it saves no time"""
+        """whether arrays are in pinned memory; on a CPU, pinned memory saves no time"""
         self._requested: set[int] = set()
         """capacities that were requested before"""
         self._spare: dict[int, list[_PinnedBuffer]] = {}

@@ -100,8 +100,9 @@ RAY_UNIFORMS = uniforms(
 _TILES = args("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _IMAGE_SIZE)
 _RESERVED = args(
     *("uint count", "in uint keys", _TILES),
-    "out uint gradient_offsets  // (n) first gradient buffer offset of each splat, which has one per tile",
-    "out uint reserved  // (2) number of reserved gradient buffer offsets, number of claimed tiles",
+    "out uint gradient_offsets  // (n) first gradient buffer offset of each splat; a splat has one per tile",
+    "out uint reserved  // (2) number of reserved gradient buffer offsets, number of tiles that work-items "
+    "have started",
 )
 
 _BLENDED = args(
@@ -223,7 +224,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_gradients": args(
         *(
             _RESERVED,
-            "out uint big_rows  // (rows of tiles, big splats) index of a tile in its splat minus its column",
+            "out uint big_rows  // (rows of tiles, big splats) gradient buffer offset of a tile, relative to "
+            "the splat's first one, minus the tile's column",
         )
     ),
     "blend_backward": args(
@@ -241,7 +243,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float record_gradients  // records RecordGradient by gradient buffer offset",
         "out real background_sums  // (tiles, 3) with respect to the background",
         "out float tapes  // a Tape for each work-item",
-        "out uint reserved  // (2) number of reserved gradient buffer offsets, number of claimed tiles",
+        "out uint reserved  // (2) number of reserved gradient buffer offsets, number of tiles that "
+        "work-items have started",
     ),
     "project_backward": args(
         *("uint count", "in View view", "cloud float means quats scales opacities"),
@@ -312,7 +315,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "align_noise": args("int width height channels stage", "in float image", "out uint counts"),
     "align_thresholds": args(
         *("int stages", "uint max_pixels", "out uint counts"),
-        "out uint thresholds  // lowest bin and pixels of each stage; then bits of a float, a median",
+        "out uint thresholds  // (2 stages + 1) lowest used bin of each stage, number of pixels of each "
+        "stage, median (bits of a float)",
     ),
     "align_errors": args(
         *(_ALIGNED, "int radius", "in float taps rendered", "out float rgb", "out uint counts  // (BINS)")
@@ -404,7 +408,8 @@ GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "blend_checkpoints": args(
         *("in Splat splats", "in uint lists starts", _IMAGE_SIZE, _BLENDED),
-        "out float checkpoints  // by pixel and segment: T in front, gradient with respect to T behind",
+        "out float checkpoints  // by pixel and segment: T in front of it, and gradient with respect to T "
+        "behind it",
         "out uint reached_segments  // (tiles) number of segments before the transmittance stop",
         "out uint segment_tiles  // tile of each segment",
         "out real background_sums  // (tiles, 3) with respect to the background",

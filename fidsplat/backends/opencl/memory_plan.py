@@ -38,7 +38,8 @@ TILE_TABLES = 5
 UNIFORM_BYTES = 1 << 14
 """upper bound of the bytes of uniforms, counts and moving groups"""
 SUB_BATCH_BYTES = {"cpu": 1 << 28}
-"""maximum bytes of the views rendered together, without images, by kind of device; more is not faster"""
+"""maximum bytes, without images, of the views that are rendered together, by kind of device; larger ones are
+not faster"""
 OTHER_SUB_BATCH_BYTES = 1 << 31
 _SUB_BATCH_SAMPLES = 1 << 30
 """maximum samples of a sub-batch; kernels use 32-bit indices for several channels of samples"""

@@ -249,7 +249,7 @@ class OpenCLPipeline(Pipeline):
         cached[key] = RecordedFrame(plan, CommandList(self.program))
 
     def _key(self, view: View) -> tuple[Any, ...]:
-        """Key of frames with the same command list, which differ only in numeric arguments."""
+        """Key of a command list: frames with the same key differ only in numeric arguments."""
         labels, budgets = tuple(dict(view.groups)), (self.workspace.memory_budget, self.workspace.pair_budget)
         return self, view.width, view.height, view.raster, labels, budgets
 

@@ -45,7 +45,8 @@ def build_options(device: cl.Device) -> list[str]:
     version, target = device.version, device.version
     if needs_patch(version):
         target = patch_target(device.int_ptr, version)
-    # pyopencl's cache key has the version string, which names the processor; a patched name must be added
+    # pyopencl's cache key contains the version string, which names the processor. A patched target is not in
+    # that string, so that an option names the target.
     target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
     rounds = device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT

@@ -27,8 +27,8 @@ _ZERO = np.zeros(1, np.uint32)
 
 
 class RecordedFrame:
-    """The memory plan of rendered frames of a cloud and, once `record` is called, their command list with the
-    arguments that differ between views. It must not reference the cloud, which caches it."""
+    """Memory plan, and after `record` the command list, of the frames of one cloud and size. The arguments of
+    the command list differ between views. A RecordedFrame must not reference the cloud, which caches it."""
 
     def __init__(self, plan: MemoryPlan, commands: CommandList) -> None:
         self.plan, self.commands = plan, commands

@@ -64,7 +64,8 @@ def allocate_counters(frame: DeviceFrame, words: int, big: int = 0) -> None:
 
 def cull(frame: DeviceFrame, big: int) -> None:
     """List the groups of splats that are not culled by their bounding spheres, and set
-    `frame.records_per_view`. big: see `allocate_counters`, which is called again with a longer list."""
+    `frame.records_per_view`. big: see `allocate_counters`, which is called again if the buffer `unculled`
+    must be enlarged."""
     pool, culling_groups = frame.pool, -(-frame.cloud.count // CULLING_GROUP)
     frame.scratch("unculled", 4 * _MIN_UNCULLED // CULLING_GROUP)
     for name in ("spheres", "max_scales", "splat_ids"):
