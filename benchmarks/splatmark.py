@@ -289,7 +289,7 @@ def readme_cell(group: Group) -> str:
         if group.next is not None:
             found.append("then {} ({:.2g} x)".format(*group.next))
     if group.by_mean and (group.winner is None or group.by_mean[0].renderer != group.winner.renderer):
-        found.append(f"by mean error {group.by_mean[0].renderer}")
+        found.append(f"by mean error: **{group.by_mean[0].renderer}**")
     return ", ".join(found)
 
 
