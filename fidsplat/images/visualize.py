@@ -9,7 +9,7 @@ import numpy as np
 _BACKGROUND = (90, 90, 90)
 _SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel
 _OUTLINE = (255, 60, 200)
-_SHEET = 28  # grey level of a sheet's background
+_SHEET_BACKGROUND = 28  # grey level of a sheet's background
 KEY_WIDTH = 132  # pixels of the colour key next to the images of a sheet
 
 
@@ -57,7 +57,7 @@ def color_normals(normal: np.ndarray) -> np.ndarray:
 
 def normal_key(height: int) -> np.ndarray:
     """Colour key of `color_normals`, (height, KEY_WIDTH, 3): a sphere in the colours of its normals."""
-    key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
+    key = np.full((height, KEY_WIDTH, 3), _SHEET_BACKGROUND, np.uint8)
     radius, middle = 34, (KEY_WIDTH // 2, height // 2)
     y, x = (np.mgrid[-radius : radius + 1, -radius : radius + 1]) / radius
     inside = x * x + y * y <= 1
@@ -126,7 +126,7 @@ def draw_outlines(
             foot += 1
         box = (left - 4, foot - line + 8, left + wide + 4, foot + 8)
         occupied.append(box)
-        cv2.rectangle(marked, box[:2], box[2:], (_SHEET,) * 3, -1)
+        cv2.rectangle(marked, box[:2], box[2:], (_SHEET_BACKGROUND,) * 3, -1)
         write(marked, text, (left, foot), size=size)
     return marked
 
@@ -171,7 +171,7 @@ def contact_sheet(
     columns = max(len(row) for row in cells)
     key_left = gap + columns * (width + gap)
     across = key_left + (KEY_WIDTH + gap if key else 0)
-    sheet = np.full((gap + len(rows) * (title + height + gap), across, 3), _SHEET, np.uint8)
+    sheet = np.full((gap + len(rows) * (title + height + gap), across, 3), _SHEET_BACKGROUND, np.uint8)
     for i, row in enumerate(cells):
         for j, (name, image) in enumerate(row):
             x, y = gap + j * (width + gap), gap + i * (title + height + gap)
@@ -190,7 +190,7 @@ _TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)  # positions of a colour bar's ticks, from 
 def _color_bar(height: int, color: Callable[[np.ndarray], np.ndarray], words: list[str]) -> np.ndarray:
     """Colour bar with labelled ticks. colour: maps positions from 0 (bottom) to 1 to [0, 1] of the turbo
     map."""
-    key = np.full((height, KEY_WIDTH, 3), _SHEET, np.uint8)
+    key = np.full((height, KEY_WIDTH, 3), _SHEET_BACKGROUND, np.uint8)
     left, right, top, foot = 10, 34, 8, height - 9
     key[top : foot + 1, left:right] = _turbo(color(np.linspace(1, 0, foot + 1 - top)))[:, None].reshape(
         -1, 1, 3

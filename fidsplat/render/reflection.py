@@ -43,23 +43,25 @@ class GlossyBrdf(NamedTuple):
             cosine: (n, v), between directions to viewers and normals.
             to_viewer, to_light, normal: unit directions (n, v, 3), (n, 3) and (n, 3).
         """
-        square = self.alpha**2
-        light = np.einsum("nc,nc->n", to_light, normal)[:, None]
-        above = (cosine > _MIN_COSINE) & (light > _MIN_COSINE)
-        view, light = np.maximum(cosine, _MIN_COSINE), np.maximum(light, _MIN_COSINE)
+        alpha2 = self.alpha**2
+        cos_light = np.einsum("nc,nc->n", to_light, normal)[:, None]
+        above = (cosine > _MIN_COSINE) & (cos_light > _MIN_COSINE)
+        cos_view, cos_light = np.maximum(cosine, _MIN_COSINE), np.maximum(cos_light, _MIN_COSINE)
         cosine_between = np.einsum("nvc,nc->nv", to_viewer, to_light)
         length = np.sqrt(np.maximum(2 + 2 * cosine_between, 1e-12))
-        cosine_half = (view + light) / length
-        distribution = square / (np.pi * (cosine_half**2 * (square - 1) + 1) ** 2)
-        visibility = 0.5 / (light * _smith_root(view, square) + view * _smith_root(light, square))
+        cosine_half = (cos_view + cos_light) / length
+        distribution = alpha2 / (np.pi * (cosine_half**2 * (alpha2 - 1) + 1) ** 2)
+        visibility = 0.5 / (
+            cos_light * _smith_root(cos_view, alpha2) + cos_view * _smith_root(cos_light, alpha2)
+        )
         # the cosine is between the viewer and the half vector
         factor = fresnel((1 + cosine_between) / length, self.reflectance)
-        return np.where(above, distribution * visibility * factor * light, 0.0)
+        return np.where(above, distribution * visibility * factor * cos_light, 0.0)
 
     def sample(self, to_viewer: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Importance samples of visible normals (Heitz 2018): directions (n, v, k, 3) to incoming light, and
         weights (n, v, k). The sum of weights times radiance is the radiance towards viewers (n, v, 3)."""
-        square, i = self.alpha**2, np.arange(_LOBE_SAMPLES)
+        alpha2, i = self.alpha**2, np.arange(_LOBE_SAMPLES)
         radius, phi = np.sqrt((i + 0.5) / _LOBE_SAMPLES), 2 * np.pi * _van_der_corput(_LOBE_SAMPLES)
         axes = np.concatenate([perpendicular(normal), normal[:, None]], 1)
         local = np.einsum("nvd,ncd->nvc", to_viewer, axes)
@@ -79,10 +81,12 @@ class GlossyBrdf(NamedTuple):
         local = local[..., None, :]
         cosine = np.sum(local * half_vector, axis=-1, keepdims=True)
         reflected = 2 * cosine * half_vector - local
-        light, view = reflected[..., 2], np.maximum(local[..., 2], _MIN_COSINE)
-        above = light > _MIN_COSINE
-        masking = light * (view + _smith_root(view, square))
-        masking = masking / (light * _smith_root(view, square) + view * _smith_root(light, square))
+        cos_light, cos_view = reflected[..., 2], np.maximum(local[..., 2], _MIN_COSINE)
+        above = cos_light > _MIN_COSINE
+        masking = cos_light * (cos_view + _smith_root(cos_view, alpha2))
+        masking = masking / (
+            cos_light * _smith_root(cos_view, alpha2) + cos_view * _smith_root(cos_light, alpha2)
+        )
         weights = np.where(above, fresnel(cosine[..., 0], self.reflectance) * masking / _LOBE_SAMPLES, 0.0)
         return np.einsum("nvkc,ncd->nvkd", reflected, axes), weights
 
@@ -96,9 +100,9 @@ def fresnel(cosine: np.ndarray, reflectance: float) -> np.ndarray:
     return 0.5 * (difference / total) ** 2 * (1 + ((c * total - 1) / (1 + c * difference)) ** 2)
 
 
-def _smith_root(cosine: np.ndarray, square: float) -> np.ndarray:
-    """Square root in Smith's masking function. square: GGX width squared."""
-    return np.sqrt(cosine**2 * (1 - square) + square)
+def _smith_root(cosine: np.ndarray, alpha2: float) -> np.ndarray:
+    """Square root in Smith's masking function. alpha2: GGX width squared."""
+    return np.sqrt(cosine**2 * (1 - alpha2) + alpha2)
 
 
 def _van_der_corput(count: int) -> np.ndarray:

@@ -48,14 +48,15 @@ class Densification(NamedTuple):
 
 
 def densification(
-    splats: Splats, settings: TrainSettings, iteration: int, extent: float, free: np.ndarray | bool = True
+    splats: Splats, settings: TrainSettings, iteration: int, extent: float, keep: np.ndarray | bool = True
 ) -> Densification:
     """Choose the splats to clone, split and prune.
 
     Args:
         splats: the splats; harmonics and moments may be missing.
         extent: scene extent [m], the unit of size thresholds.
-        free: mask (n,) of the splats to keep if they are visible, False for those in front of markers.
+        keep: mask (n,): False prunes the splat, for example in front of a marker. Nearly transparent and too
+            large splats are pruned in any case.
 
     Raises:
         TrainingError: no splat would remain.
@@ -74,7 +75,7 @@ def densification(
     unsplit[splits] = False
     means, log_scales = _split_values(splats, splits, settings, iteration)
     copies = np.concatenate([splits] * COPIES)
-    unpruned = (sigmoid(splats.values["logits"]) >= settings.prune_opacity) & free
+    unpruned = (sigmoid(splats.values["logits"]) >= settings.prune_opacity) & keep
     unpruned_copies = unpruned[copies]
     if iteration > settings.reset_every:
         limit = settings.prune_scale * extent
