@@ -188,8 +188,8 @@ class AlignmentKernels(ABC):
     @property
     @abstractmethod
     def noise(self) -> float:
-        """Standard deviation of the noise of the image at the last stage, from the median of the second
-        differences along every eighth row; waits for the device."""
+        """Standard deviation of the noise of the image at the last stage (`noise_of`), along every eighth
+        row; waits for the device."""
 
     def check_pixels(self) -> None:
         """Raise InputError if a stage uses no pixel; waits for the device."""
@@ -275,5 +275,6 @@ def lowest_bin(counts: np.ndarray, max_pixels: int) -> int:
 
 
 def noise_of(median: float) -> float:
-    """Standard deviation of the noise of an image, from the median of its second differences."""
+    """Standard deviation of the noise of an image, from the median of |v - (left + right) / 2| over its
+    values v: half of the absolute second differences along a row."""
     return median / (0.6745 * 1.5**0.5)

@@ -82,8 +82,8 @@ class DeviceCloud(ABC):
     def color_range(self) -> tuple[float, float]:
         """Lower and upper bound of every channel of every splat, from any direction."""
         raise InputError(
-            "the splats must be in host memory for the output 'error', got arrays on the device "
-            "(Renderer.wrap_arrays); render a SplatCloud, or leave out 'error'"
+            "the splats must have a known range of colours for the output 'error', got splats on a device "
+            "that does not compute it; use another device, or leave out 'error'"
         )
 
 
@@ -290,9 +290,9 @@ class GradientPipeline(ABC):
             Device arrays, bit-identical on every run and valid until the next call: `means` (n, 3), `quats`
             (n, 4), `scales` (n, 2), `thickness` (n,) if the cloud has it, `opacities` (n,), `colors` (n, 3)
             or `sh` (n, k, 3); `grad2d` (n,), the norm of the gradient with respect to the projected centre in
-            units of half images (dL_dmean2D of 2DGS trainers); `background` (3,); `pose` (6,), rotation
-            vector [1 / rad] and translation [1 / m] of a motion after world_to_camera, in camera axes;
-            `intrinsics` (4,): fx, fy, cx, cy [1 / px]. Culled splats have zeros.
+            units of half images, at constant depth (dL_dmean2D of 2DGS trainers); `background` (3,); `pose`
+            (6,), rotation vector [1 / rad] and translation [1 / m] of a motion after world_to_camera, in
+            camera axes; `intrinsics` (4,): fx, fy, cx, cy [1 / px]. Culled splats have zeros.
 
         Raises:
             CapacityExceeded: `forward` did not wait, and the buffers were too small; the next frame has
@@ -318,7 +318,8 @@ class Backend(ABC):
     pair_budget: int = 2**30 - 1
     """maximum number of (splat, tile) pairs in the tile lists at once; tests lower it"""
     memory_bytes: int = 0
-    """device memory of scratch buffers, without clouds and images"""
+    """device memory of scratch buffers and of buffers of released images, without clouds and images in
+    use"""
 
     def has(self, method: str) -> bool:
         """Whether the device implements an optional method, for example `probe`."""

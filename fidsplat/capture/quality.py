@@ -151,8 +151,9 @@ class Quality:
     """Arithmetic of fragments. `float16` sums colours and transmittance in half precision, always with
     approximate arithmetic: faster on NVIDIA's GPUs, slower on others; n fragments with colours up to 1 change
     a pixel by at most (n + 3) / 2048. `float64` computes intersection, weight and blending in float64, for
-    reference images: many times slower, always with precise arithmetic; requires a device with float64 and
-    `projection_precision="float64"`."""
+    reference images: many times slower, always with precise arithmetic; requires OpenCL with float64 or
+    the device `reference`, `projection_precision="float64"`, and a pinhole or orthographic camera. Fog
+    requires `float32`."""
 
     marker: MarkerQuality = field(default_factory=MarkerQuality)
     """Conversion of markers to splats."""

@@ -77,7 +77,9 @@ class ImageMapping(Mapping[str, np.ndarray]):
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage, for all views together: project, sort, bin, blend, resolve,
-        and accumulate (shutters); `error`: all stages of the second image that the output `error` renders.
+        and accumulate (shutters); of gradients reserve (OpenCL), blend backward and project backward;
+        `error`: all stages of the second image that the output `error` renders. The device `reference` has
+        one stage, `reference`.
 
         On a GPU, most frames replay a recorded command list, and are rendered again to measure these times,
         since timing each launch would slow down all frames. Empty if the frame's cloud has been released.

@@ -25,13 +25,14 @@ class Frame(ImageMapping):
     metres along z (fisheyes and panoramas: along the ray); `distance`, `distance_median`, `distance_first`
     metres along the ray; `normal` (h, w, 3) unit, camera frame, towards the camera, `normal_world` the same
     in the world's axes; `label`, `splat_id` (h, w) int32, of the fragment or coplanar layer with the largest
-    weight; `blended` (h, w) int32, number of composited splats; `error` (h, w), an upper bound of
-    |rgb - ideal| (fidsplat/render/certified_error.py).
+    weight; `blended` (h, w) int32, number of composited splats, with several samples the maximum over the
+    samples; `error` (h, w), an upper bound of |rgb - ideal| (fidsplat/render/certified_error.py).
     `depth_median` is the depth of the last fragment or layer in front of which the transmittance is above one
-    half, without fragments of weight below 1/255; `depth_first` is the depth of the first fragment or layer
-    at which the accumulated opacity reaches `Quality.first_hit` (docs/rendering.md has the definitions). In
-    pixels with an alpha below 1/255 (`_first` outputs: below `first_hit`) `label` and `splat_id` are -1, and
-    depths, distances and normals are 0.
+    half. Consecutive fragments of weight below 1/255 count as one, at the depth where the sum of their
+    weights reaches 1/255. `depth_first` is the depth of the first fragment or layer at which the accumulated
+    opacity reaches `Quality.first_hit` (docs/rendering.md has the definitions). In pixels with an alpha below
+    1/255 (`_first` outputs: below `first_hit`) `label` and `splat_id` are -1, and depths, distances and
+    normals are 0.
     """
 
     _noun = "frame"

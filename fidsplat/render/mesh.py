@@ -42,13 +42,13 @@ def scene_mesh(
 
     Args:
         cameras: views; by default up to 64 views from a sphere around the scene; if the scene has a ground,
-            only views at least 6 degrees above the horizontal.
+            only views at least 5.7 degrees above the horizontal.
         voxel: metres; by default a 200th of the longest side of the scene.
         renderer: by default one on the scene's device.
         progress: called with the name of the current step and its completed fraction.
 
     Raises:
-        InputError: no splats; a voxel size that is not positive or too small.
+        InputError: no splats; no cameras; a voxel size that is not positive or too small.
     """
     low, high = _bounds(scene)
     size = float((high - low).max())
@@ -95,7 +95,7 @@ def _cosine(normal: np.ndarray, camera: Camera) -> np.ndarray:
 
 def views_around(scene: Scene, low: np.ndarray, high: np.ndarray) -> list[Camera]:
     """Cameras on a sphere around a bounding box, spaced by the golden angle; if the scene has a
-    ground, none less than 6 degrees above the horizontal."""
+    ground, none less than 5.7 degrees above the horizontal."""
     up_axis = guess_up(scene.cloud())
     center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     distance = radius / math.sin(FOV / 2)

@@ -249,7 +249,7 @@ class _BandImages(Images):
 
     @property
     def timings(self) -> dict[str, float]:
-        """Milliseconds of each stage on the slowest device."""
+        """Milliseconds of each stage, on the device that is slowest in this stage."""
         timings = [frame.timings for frame in self.frames]
         return {stage: max(ms.get(stage, 0.0) for ms in timings) for stage in timings[0]}
 

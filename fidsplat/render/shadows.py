@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fidsplat.render.resident import ResidentCloud
 
 MAX_PIXELS = 512
-"""maximum pixels of a shadow map along a side"""
+"""maximum pixels of the marker along a side of a shadow map, without the border"""
 _MARGIN = 4
 """width [pixels] of the border around the marker"""
 _MAX_TANGENT = np.tan(np.radians(80))

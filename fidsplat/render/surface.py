@@ -49,7 +49,8 @@ def surface_at(
         camera: used at its own pose. Default: the scene's camera at the shutter time.
         pixel: (x, y), 0 to width and 0 to height.
         ray: (origin (3,), direction (3,)) in the world, instead of camera and pixel.
-        radius: metres, radius of the patch; by default 2 % of the width of the image, at least 8 pixels.
+        radius: metres, radius of the patch; by default 2 % of the width of the image, at least 8 pixels;
+            along a ray 0.025 times the distance.
         renderer: by default one on the scene's device.
         resident: the uploaded scene, for many calls.
 

@@ -100,8 +100,8 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_texture(
     add_bins(group_counts, counts + stage * BINS);
 }
 
-// Index space: any number of work-groups of ITEMS, by every eighth row. Adds the second differences along the rows of an image to a
-// histogram, for the noise of the image.
+// Index space: any number of work-groups of ITEMS, by every eighth row. Adds half of the absolute second differences along the
+// rows of an image to a histogram, for the noise of the image.
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_noise(
 //@@ arguments align_noise
 ) {
@@ -134,7 +134,7 @@ static inline float median_of(global const uint *counts, local uint *shares) {
 
 // Index space: one work-group of ITEMS per stage, and one more. Reads and clears: the histograms of `align_texture` and `align_noise`.
 // Writes: of each stage the lowest bin to use, so that it and the higher bins have about max_pixels pixels; their numbers of pixels; the
-// median of the second differences.
+// median of the values of `align_noise`.
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_thresholds(
 //@@ arguments align_thresholds
 ) {

@@ -357,7 +357,8 @@ def backward_items(features: FeatureSet, config: KernelConfig) -> int:
 
 
 def segment_size(features: FeatureSet, config: KernelConfig) -> int:
-    """Number of splats of a tile's list that the backward pass evaluates at once."""
+    """Number of splats in a segment, the part of a tile's list that the backward pass evaluates at once; with
+    the schedule `lanes` their minimum (`KernelConfig.tape`)."""
     if config.schedule == "lanes":
         return config.tape
     return backward_items(features, config) // config.tile_width

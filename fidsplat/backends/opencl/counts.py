@@ -13,7 +13,8 @@ COUNTS = 4
 COUNTERS = 8
 """counters of the buffer `counters`, as in prelude.cl"""
 VISIBLE, PAIRS, BIG = 0, 2, 6
-"""indices of the counters with totals: visible splats, pairs (two words), big splats"""
+"""indices of the counters with totals: visible splats (with `KernelConfig.culls_first` groups of splats that
+are not culled), pairs (two words), big splats"""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Counts:
 
     @staticmethod
     def of_counters(words: np.ndarray) -> Counts:
-        """Counts of a frame from the buffer `counters` (views, COUNTERS); `big` of the first view only."""
+        """Counts of a frame from the buffer `counters` (views, COUNTERS), without `culls_first`. The first
+        row has the pairs and big splats of all views, and each row the visible splats of its view."""
         first, visible = words[0].tolist(), sum(words[:, VISIBLE].tolist())
         return Counts(first[BIG], first[PAIRS] | first[PAIRS + 1] << 32, visible)
 

@@ -338,10 +338,10 @@ EFFECT_CODE: dict[str, EffectCode] = {
         project=args("cloud int splat_ids  // (n)"),
         sample_buffers=(SampleBuffer("float", "splat_id_raw"), SampleBuffer("int", "splat_id_index_raw")),
     ),
+    "blended": EffectCode("output/blended.cl", sample_buffers=(SampleBuffer("int", "blended_raw"),)),
     # internal: number of composited fragments, for `fidsplat bench`; rounding bound, for the output `error`
     "overdraw": EffectCode("output/overdraw.cl", sample_buffers=(SampleBuffer("int", "overdraw_raw"),)),
     "rounding": EffectCode("output/rounding.cl", sample_buffers=(SampleBuffer("float", "rounding_raw"),)),
-    "blended": EffectCode("output/blended.cl", sample_buffers=(SampleBuffer("int", "blended_raw"),)),
     # effects on the resolved rgb
     "fog": EffectCode(
         "output/fog.cl",

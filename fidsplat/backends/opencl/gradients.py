@@ -170,8 +170,9 @@ class OpenCLGradients(GradientPipeline):
         frame.launch("blend backward", "blend_backward", (groups * items,), (items,), log_ceiling=log_ceiling)
 
     def _tape_bytes(self) -> int:
-        """Bytes of the struct `Tape` (schedule/lanes_backward.cl): per pixel and splat of a list segment,
-        transmittance and alpha; then 2 * 8 * splats + 1 words, rounded up to vectors."""
+        """Bytes of the struct `Tape` (schedule/lanes_backward.cl): per pixel and splat of the shortest
+        segment, transmittance and alpha; then two words for each splat of the longest segment, which has 8
+        times as many (TAPE_SPLATS), and one more, rounded up to vectors."""
         config = self._pipeline.config
         splats, vector = segment_size(self.features, config), 4 * config.lanes
         words = 2 * 8 * splats + 1

@@ -34,8 +34,9 @@ class KernelConfig:
     rows: int = 2
     """pixels in a column that a work-item blends (`group`)"""
     tape: int = 1024
-    """splats of a tile whose fragments are stored for the backward pass (`lanes`), 8 bytes per pixel
-    each; other fragments are computed twice"""
+    """minimum number of splats in a segment of a tile's list, whose fragments are stored for the backward
+    pass (`lanes`), 8 bytes per pixel and splat. Segments have up to 8 times as many splats if they overlap
+    few pixels. Fragments of all segments but the last are computed twice"""
     splats_per_item: int = 1
     """splats that a work-item of the project stage projects, vectorised if more than 1 (`lanes`)"""
     culls_first: bool = False

@@ -161,7 +161,7 @@ def plan_of(
     Args:
         record_bytes: bytes of the struct `Splat`.
         upload_bytes: bytes per splat that each frame copies to the device; 0 for a resident cloud.
-        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it is cloud.
+        fixed_bytes: bytes of sample buffers, outputs, tables, and the cloud if it is resident.
         binning: tile-binning strategy.
         budget: maximum total bytes.
         limit: maximum bytes of one buffer.

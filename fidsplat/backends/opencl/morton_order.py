@@ -21,7 +21,7 @@ _SAMPLE = 10_000
 
 
 class MortonOrder:
-    """A cloud's arrays sorted by position; rows of zeros complete the last group."""
+    """Order of a cloud's splats by position, and bounding spheres of groups of consecutive splats."""
 
     def __init__(self, workspace: Workspace, means: np.ndarray, buffer: cl.Buffer) -> None:
         """means, buffer: the positions (n, 3) on the host and on the device."""
@@ -49,7 +49,7 @@ class MortonOrder:
             starts = np.cumsum(starts, dtype=np.uint32) - starts  # exclusive
 
     def gather(self, name: str, source: cl.Buffer, row_bytes: int) -> cl.Buffer:
-        """The rows of an array in this order."""
+        """Copy an array in this order; rows of zeros complete the last group."""
         words = row_bytes // 4
         gathered = self._workspace.pool.allocate(
             f"the cloud's {name}", self.groups * CULLING_GROUP * row_bytes
