@@ -76,7 +76,7 @@ class ImageMapping(Mapping[str, np.ndarray]):
 
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage, for all views together: project, sort, bin, blend, resolve,
+        """Milliseconds on the device by stage, summed over all views: project, sort, bin, blend, resolve,
         and accumulate (shutters); of gradients reserve (OpenCL), blend backward and project backward;
         `error`: all stages of the second image that the output `error` renders. The device `reference` has
         one stage, `reference`.

@@ -52,7 +52,9 @@ def lit_scene(scene: Scene, renderer: Any) -> Scene:
     if not any(placed.light for placed in scene.markers):
         return scene
     environment = _Environment(scene, renderer)
-    markers = tuple(_lit(placed, environment) if placed.light else placed for placed in scene.markers)
+    markers = tuple(
+        _shaded_marker(placed, environment) if placed.light else placed for placed in scene.markers
+    )
     for number, light in enumerate(scene.lights):
         if isinstance(light, PointLight) and number not in environment.reaching_lights and light.power.any():
             environment.refuse_inside(number, light)
@@ -171,7 +173,7 @@ class _IncomingLight(NamedTuple):
     """points of lights, with the visibility (m,) of each from the sample points"""
 
 
-def _lit(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
+def _shaded_marker(placed: PlacedMarker, environment: _Environment) -> PlacedMarker:
     """The marker with the colours computed for its light; its field `light` is None.
 
     Glossy markers: with view='camera' their colours hold for the scene's camera only, with 'any' they are

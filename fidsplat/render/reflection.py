@@ -51,12 +51,12 @@ class GlossyBrdf(NamedTuple):
         length = np.sqrt(np.maximum(2 + 2 * cosine_between, 1e-12))
         cosine_half = (cos_view + cos_light) / length
         distribution = alpha2 / (np.pi * (cosine_half**2 * (alpha2 - 1) + 1) ** 2)
-        visibility = 0.5 / (
+        smith_term = 0.5 / (
             cos_light * _smith_root(cos_view, alpha2) + cos_view * _smith_root(cos_light, alpha2)
         )
         # the cosine is between the viewer and the half vector
         factor = fresnel((1 + cosine_between) / length, self.reflectance)
-        return np.where(above, distribution * visibility * factor * cos_light, 0.0)
+        return np.where(above, distribution * smith_term * factor * cos_light, 0.0)
 
     def sample(self, to_viewer: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Importance samples of visible normals (Heitz 2018): directions (n, v, k, 3) to incoming light, and

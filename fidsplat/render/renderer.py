@@ -72,7 +72,7 @@ class Renderer:
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
         self._pid, self._lock = os.getpid(), threading.Lock()
-        self._lit: WeakKeyDictionary[Scene, Scene] = WeakKeyDictionary()
+        self._lit_scenes: WeakKeyDictionary[Scene, Scene] = WeakKeyDictionary()
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
@@ -123,9 +123,9 @@ class Renderer:
         """
         if not any(placed.light for placed in scene.markers):
             return scene
-        if scene not in self._lit:
-            self._lit[scene] = lit_scene(scene, self)
-        return self._lit[scene]
+        if scene not in self._lit_scenes:
+            self._lit_scenes[scene] = lit_scene(scene, self)
+        return self._lit_scenes[scene]
 
     def wrap_arrays(
         self,

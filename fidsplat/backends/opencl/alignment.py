@@ -50,7 +50,7 @@ _POSE = 15
 _FIRST_CHECK = 4
 """number of steps after which the host first reads whether a stage with at least twice as many has
 converged"""
-_ATTEMPTS = 8
+_MAX_RECORDINGS = 8
 """maximum number of attempts to record commands while buffers are replaced"""
 _MAX_REPLAYS = 16
 """maximum number of cached command lists of a cloud"""
@@ -231,7 +231,7 @@ class OpenCLAlignment(AlignmentKernels):
         if self._items == 1:
             return None
         pose = at.pose
-        for attempt in range(_ATTEMPTS):
+        for attempt in range(_MAX_RECORDINGS):
             with self._workspace.rendering():
                 recorded = self._recorded(at, steps, last, tolerance)
                 if recorded is not None:
@@ -251,7 +251,7 @@ class OpenCLAlignment(AlignmentKernels):
         """Frames, commands of each stage, and of the score at the stage `last`. None if the frames cannot be
         replayed."""
         channels, pool = len(at.fit.gain), self._workspace.pool
-        for _ in range(_ATTEMPTS):  # recording may replace buffers of earlier recordings
+        for _ in range(_MAX_RECORDINGS):  # recording may replace buffers of earlier recordings
             generation, replayed = pool.generation, self._replay(at.pose)
             if replayed is None:
                 continue

@@ -43,7 +43,7 @@ from fidsplat.util.errors import InputError
 _GROUP = 64  # work-group size: RESERVE_ITEMS, POSE_ITEMS, SUM_ITEMS and STEP_ITEMS of the kernels
 _SUMS = {"background": 3, "pose": 6, "intrinsics": 4}
 """gradients that are sums over tiles or splats, and their number of components"""
-_CAMERA = 10  # pose and intrinsics
+_CAMERA_SUMS = 10  # pose and intrinsics
 _REFINE_ITEMS = 240  # of kernels/opencl/train/refine_view.cl
 _ERROR_CONTEXT = "taking derivatives"
 _F32 = np.dtype(np.float32)
@@ -297,7 +297,7 @@ class TileGradients:
         """Allocate the sums of work-groups for the camera, and return the number of work-groups."""
         groups = -(-frame.cloud.count // _GROUP)
         real = self.pipeline.source.scalar_types.dtype("real").itemsize
-        frame.scratch("camera_sums", _CAMERA * real * groups)
+        frame.scratch("camera_sums", _CAMERA_SUMS * real * groups)
         return groups
 
     def _sum_gradients(self, frame: DeviceFrame, results: Mapping[str, Array], groups: int) -> None:
