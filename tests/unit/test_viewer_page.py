@@ -37,6 +37,12 @@ def viewer(tmp_path, monkeypatch):
     running_viewer.close()
 
 
+def edit(path, text):
+    """Replace a file at once: a viewer that reads it after its truncation shows a part of it."""
+    path.with_suffix(".new").write_text(text)
+    path.with_suffix(".new").replace(path)
+
+
 def test_what_a_browser_gets_and_asks(viewer):
     client = Client()
     viewer._enter(client)
@@ -263,9 +269,9 @@ def test_large_splat_files_move_once_they_are_let_go(monkeypatch):
 
 def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
     text = (tmp_path / "scene.toml").read_text()
-    (tmp_path / "scene.toml").write_text(text.replace("0.4\n", "0.2\n", 1))
+    edit(tmp_path / "scene.toml", text.replace("0.4\n", "0.2\n", 1))
     assert until(lambda: viewer.session.state.scene.markers[0].marker.size == 0.2)
-    (tmp_path / "scene.toml").write_text(text.replace("size", "sise"))
+    edit(tmp_path / "scene.toml", text.replace("size", "sise"))
     assert until(lambda: "the previous scene is shown" in viewer._controls.status.content)
     assert "did you mean 'size'" in viewer._controls.status.content
     assert viewer.session.state.scene.markers[0].marker.size == 0.2
@@ -281,14 +287,14 @@ def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path)
         + "[fog]\ndensity = 3\n[camera]\nwidth = 48\nheight = 36\nfov_x_deg = 60\n"
         + "position = [0, 0, -1]\nlook_at = [0, 0, 0]\n[camera.distortion]\nk1 = -0.1\n"
     )
-    path.write_text(edited)
+    edit(path, edited)
     assert until(lambda: viewer._controls._lens.value == "scene")
     assert until(lambda: not viewer._controls._session._working)
     settings = viewer.session.state.settings
     assert (settings.fog, settings.lens, settings.exposure) == (3.0, "scene", 2.0)
     assert (sliders["fog"].value, sliders["exposure"].value) == (3.0, 2.0)
     assert sliders["fog"].max >= 3.0
-    path.write_text(edited.partition("[camera.distortion]")[0])
+    edit(path, edited.partition("[camera.distortion]")[0])
     assert until(lambda: "scene" not in viewer._controls._lens.options)
     assert viewer.session.settle()
     settings = viewer.session.state.settings
@@ -330,13 +336,13 @@ def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_pa
     file, table = tmp_path / "scene.toml", '[[markers]]\nspec = "aruco:4x4_50:8"\nsize = 0.4\n'
     edited = table.replace("0.4", "-1") + file.read_text()
     viewer.select_target("1: aruco:4x4_50:7")
-    file.write_text(edited)
+    edit(file, edited)
     assert until(lambda: "the previous scene is shown" in viewer._controls.status.content)
     viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)
     assert viewer.session.settle()
     assert file.read_text() == edited
     assert "nothing was written" in viewer._controls.status.content
-    file.write_text(edited.replace("-1", "0.4"))
+    edit(file, edited.replace("-1", "0.4"))
     assert until(lambda: len(viewer._controls._targets.options) == 3)
     assert viewer._controls._targets.options[2] == "2: aruco:4x4_50:7"
     viewer._move(np.eye(4), True)  # no target is selected
