@@ -233,5 +233,5 @@ def _uint8_kernel(workspace: Workspace) -> tuple[cl.Kernel, int]:
         load_invoker()
         values = 16 if workspace.config.schedule == "lanes" else 4
         program = build(workspace, kernel_text("uint8.cl"), f"-DVALUES={values}")
-        _KERNELS[workspace] = program.to_uint8, values
+        _KERNELS[workspace] = cl.Kernel(program, "to_uint8"), values
     return _KERNELS[workspace]
