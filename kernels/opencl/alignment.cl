@@ -60,6 +60,12 @@ kernel void align_blur(
     }
 }
 
+// Clear a work-group's histogram.
+static inline void clear_bins(local uint *group_counts) {
+    for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
 // Add a work-group's histogram to the histogram of all groups.
 static inline void add_bins(local uint *group_counts, global uint *counts) {
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -79,8 +85,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_texture(
 //@@ arguments align_texture
 ) {
     local uint group_counts[BINS];
-    for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
-    barrier(CLK_LOCAL_MEM_FENCE);
+    clear_bins(group_counts);
     for (int y = get_group_id(0); y < height; y += get_num_groups(0))
         for (int x = get_local_id(0); x < width; x += ITEMS) {
             int i = y * width + x;
@@ -106,8 +111,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_noise(
 //@@ arguments align_noise
 ) {
     local uint group_counts[BINS];
-    for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
-    barrier(CLK_LOCAL_MEM_FENCE);
+    clear_bins(group_counts);
     for (int y = 8 * get_group_id(0); y < height; y += 8 * get_num_groups(0)) {
         global const float *row = image + y * (size_t)(width * channels);
         for (int i = channels + get_local_id(0); i < (width - 1) * channels; i += ITEMS)
@@ -194,8 +198,7 @@ kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1))) void align_errors(
     local uint group_counts[BINS];
     EXPOSURE;
     uint min_bin = thresholds[stage];
-    for (uint k = get_local_id(0); k < BINS; k += ITEMS) group_counts[k] = 0;
-    barrier(CLK_LOCAL_MEM_FENCE);
+    clear_bins(group_counts);
     int pixels = fit[CONVERGED] != 0.0f ? 0 : width * height;
     for (int first = get_group_id(0) * SPAN; first < pixels; first += get_num_groups(0) * SPAN)
         for (int i = first + get_local_id(0); i < min(first + SPAN, pixels); i += ITEMS) {
