@@ -74,6 +74,11 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
+def orthogonal_again(rotation: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) without the rounding of float32, by a Newton step: its error is squared."""
+    return rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
+
+
 def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray, float, np.ndarray]:
     """Split a 4x4 similarity transform into rotation (3, 3), scale and translation (3,), float64.
 

@@ -19,7 +19,7 @@ from fidsplat.backends.view import rotated
 from fidsplat.cameras import Camera
 from fidsplat.cameras.pose_offset import offset_pose
 from fidsplat.cameras.screw import rotation_matrix
-from fidsplat.splats.rotations import nearest_rotation
+from fidsplat.splats.rotations import nearest_rotation, orthogonal_again
 from fidsplat.train.dataset import Dataset, TrainingView, depths
 from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.pose import pose_error
@@ -107,9 +107,7 @@ class ViewRefinement:
         """Current camera of a view."""
         camera, pose = self._initial[view], self.poses[view]
         if (pose != self._initial_poses[view]).any():
-            rotation = pose[:3, :3]
-            # orthogonal again: kernels multiply rotations, possibly in float32
-            rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
+            rotation = orthogonal_again(pose[:3, :3])  # kernels multiply rotations, possibly in float32
             matrix = np.eye(4)
             matrix[:3, :3], matrix[:3, 3] = rotation.T, self._origin - rotation.T @ pose[:3, 3]
             camera = camera.with_pose(camera_to_world=matrix)

@@ -36,6 +36,7 @@ from fidsplat.backends.opencl.uniforms import view_records
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.cameras.raster import raster_of
+from fidsplat.splats.rotations import orthogonal_again
 
 _GROUPS = {1: 32, 64: 1024}
 """maximum number of work-groups of a sum, by the size of a work-group"""
@@ -625,8 +626,8 @@ class _PoseReplay:
 
     def world_to_camera(self, numbers: np.ndarray) -> np.ndarray:
         """(4, 4) pose from a view's rotation and translation."""
-        pose, rotation = np.eye(4), numbers[:9].reshape(3, 3).astype(float)
-        pose[:3, :3] = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)  # orthogonal in float64
+        pose = np.eye(4)
+        pose[:3, :3] = orthogonal_again(numbers[:9].reshape(3, 3).astype(float))
         pose[:3, 3] = numbers[9:12] - pose[:3, :3] @ self._origin
         return pose
 
