@@ -54,15 +54,15 @@ def convex_parts(vertices: np.ndarray, faces: np.ndarray, max_parts: int) -> lis
     done: list[ConvexPart] = []
     numbers = count(1)  # of equal costs the first one is bisected first
     while heap and len(heap) + len(done) < max_parts:
-        cost, _, part, hull = heapq.heappop(heap)
+        negative_cost, _, part, hull = heapq.heappop(heap)
         halves = surface.bisections(part)
-        if -cost <= TOLERANCE * side or not halves:
+        if -negative_cost <= TOLERANCE * side or not halves:
             done.append(hull)
             continue
-        tried = [[(surface.hull(half), half) for half in pair] for pair in halves]
-        best = min(tried, key=lambda pair: sum(surface.cost(hull, half) for hull, half in pair))
-        for hull, half in best:
-            heapq.heappush(heap, (-surface.cost(hull, half), next(numbers), half, hull))
+        hulls = [[(surface.hull(half), half) for half in pair] for pair in halves]
+        tried = [[(surface.cost(hull, half), half, hull) for hull, half in pair] for pair in hulls]
+        for cost, half, hull in min(tried, key=lambda pair: sum(cost for cost, _, _ in pair)):
+            heapq.heappush(heap, (-cost, next(numbers), half, hull))
     return done + [hull for _, _, _, hull in heap]
 
 

@@ -19,7 +19,7 @@ from fidsplat.train.optimiser import HIGHER_SH_RATE
 from fidsplat.train.parameters import NAMES, SHAPES, Splats
 from fidsplat.train.random_numbers import RandomStream
 from fidsplat.train.settings import TrainSettings
-from fidsplat.train.view_refinement import ViewRefinement, ViewStep
+from fidsplat.train.view_refinement import ViewRefinement, ViewStep, camera_intrinsics
 
 _PREFIXES = ("", "first_", "second_")
 _STATISTICS = ("gradient_sums", "visible_counts")
@@ -33,7 +33,7 @@ class DeviceModel:
         self._kernels, self._settings = kernels, settings
         self.max_pending_losses = kernels.max_pending_losses
         cameras = [view.camera for view in views]
-        intrinsics = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras])
+        intrinsics = np.array([camera_intrinsics(camera)[2:] for camera in cameras])
         kernels.load_views([(view.image, view.mask) for view in views], intrinsics)
         self._number = 0
         self._cameras = cameras
@@ -89,11 +89,9 @@ class DeviceModel:
         """Refine the views in later steps. views: their uniforms, with the cameras of the data set."""
         self._refinement = refinement
         settings = {
-            name: int(getattr(self._settings, attribute))
-            for name, attribute in (
-                *(("refine_pose", "refine_poses"), ("refine_intrinsics", "refine_intrinsics")),
-                ("refine_exposure", "fit_exposures"),
-            )
+            "refine_pose": int(self._settings.refine_poses),
+            "refine_intrinsics": int(self._settings.refine_intrinsics),
+            "refine_exposure": int(self._settings.fit_exposures),
         }
         self._kernels.load_refinement(
             refinement.arrays(), views, refinement.rows, refinement.depths, settings
